@@ -1,0 +1,96 @@
+"""Parameters of the stages: one frozen dataclass a stage, the only home of defaults.
+
+Every field is an option of the stage's command: `parameter` gives the help, the unit and the limits; angles are
+radians here and degrees on the command line (unit "rad" is converted in cli/options.py).
+"""
+
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from bsmap_cli.errors import ParameterError
+
+
+def parameter(
+    default: Any,
+    help: str,
+    unit: str = "",
+    minimum: float | None = None,
+    maximum: float | None = None,
+    choices: tuple[str, ...] = (),
+    name: str = "",
+) -> Any:
+    """Field of a parameter class; `name` is the option's name where it differs from the field's."""
+    metadata = {"help": help, "unit": unit, "min": minimum, "max": maximum, "choices": choices, "name": name}
+    return field(default=default, metadata=metadata)
+
+
+class Checked:
+    """Base of the parameter classes: values outside their limits raise ParameterError when made."""
+
+    def __post_init__(self) -> None:
+        for f in fields(self):  # type: ignore[arg-type]
+            value, meta = getattr(self, f.name), f.metadata
+            low, high, choices = meta["min"], meta["max"], meta["choices"]
+            if choices and value not in choices:
+                raise ParameterError(f"{f.name}: {value!r} is not one of {', '.join(choices)}")
+            if value is not None and ((low is not None and value < low) or (high is not None and value > high)):
+                raise ParameterError(f"{f.name}: {value} is outside [{low}, {high}]")
+
+
+@dataclass(frozen=True)
+class LogParams(Checked):
+    """Which topics of a log play which part; None: found from the mounts."""
+
+    horizontal_topic: str | None = parameter(None, "Topic of the horizontal laser (default: found from the mounts).")
+    vertical_topic: str | None = parameter(None, "Topic of the vertical laser (default: found from the mounts).")
+    odometry_topic: str | None = parameter(None, "Topic of the odometry (default: the only one).")
+    use_odometry: bool = parameter(True, "Use odometry as prior; without it, constant velocity.", name="odometry")
+
+
+@dataclass(frozen=True)
+class CloudParams(Checked):
+    """Point cloud of the vertical laser, method.md section 5."""
+
+    range_min: float = parameter(0.0, "Drop beams shorter than this.", "m", 0.0)
+    range_max: float = parameter(float("inf"), "Drop beams longer than this.", "m", 0.0)
+    range_sigma: float = parameter(0.01, "Standard deviation of a range.", "m", 1e-6, 1.0)
+    angle_sigma: float = parameter(0.0005, "Standard deviation of a beam's direction.", "rad", 0.0, 0.1)
+
+
+@dataclass(frozen=True)
+class FitParams(Checked):
+    """Movement data sets and B-spline surfaces, method.md sections 6-8."""
+
+    degree_u: int = parameter(3, "Degree along the scan lines.", "", 1, 7)
+    degree_v: int = parameter(3, "Degree across the scan lines.", "", 1, 7)
+    bound_u: float = parameter(0.01, "Largest error allowed along the scan lines.", "m", 1e-4)
+    bound_v: float = parameter(0.05, "Largest error allowed across the scan lines.", "m", 1e-4)
+    knots_per_pass: int = parameter(1, "Knots inserted before each new fit.", "", 1, 1000)
+
+
+@dataclass(frozen=True)
+class MergeParams(Checked):
+    """Overlap, division and fusion, method.md section 9."""
+
+    distance: float = parameter(0.1, "Surfaces farther apart than this do not overlap.", "m", 1e-3)
+    gate: float = parameter(0.99, "Share of true pairs that the Mahalanobis gate lets pass.", "", 0.5, 0.999999)
+    bound_u: float = parameter(0.01, "Largest error allowed along u when a merged patch is fitted.", "m", 1e-4)
+    bound_v: float = parameter(0.05, "Largest error allowed along v when a merged patch is fitted.", "m", 1e-4)
+
+
+@dataclass(frozen=True)
+class ExportParams(Checked):
+    """Meshes and surfaces."""
+
+    tolerance: float = parameter(0.005, "Largest distance of a mesh to its surface.", "m", 1e-5)
+    format: str | None = parameter(None, "Format, where the file's ending does not tell it.")
+
+
+@dataclass(frozen=True)
+class SimulateParams(Checked):
+    """Robot, lasers and noise of a simulated log."""
+
+    seed: int = parameter(0, "Seed of all randomness.", "", 0)
+    range_sigma: float = parameter(0.01, "Standard deviation of the noise along the beam.", "m", 0.0, 1.0)
+    rate: float = parameter(10.0, "Scans a second of each laser in continuous motion.", "Hz", 0.1, 100.0)
+    odometry_error: float = parameter(1.0, "Scale of the drift of the odometry (0: exact).", "", 0.0, 100.0)

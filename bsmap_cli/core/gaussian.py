@@ -1,0 +1,56 @@
+"""Gaussian estimates: gates, normalised squared errors, products of densities, packed symmetric matrices."""
+
+from functools import lru_cache
+
+import numpy as np
+
+from bsmap_cli.errors import BsmapError
+from bsmap_cli.model import Array
+
+# Order of the six terms of a packed symmetric 3x3 matrix: xx, xy, xz, yy, yz, zz.
+_ROW, _COLUMN = np.triu_indices(3)
+
+
+@lru_cache(maxsize=4096)
+def chi2_gate(probability: float, dof: int) -> float:
+    """Quantile of the chi-square distribution: a true pair's squared distance is below it with `probability`."""
+    from scipy.special import chdtri
+
+    return float(chdtri(dof, 1.0 - probability))
+
+
+def pack(matrices: Array) -> Array:
+    """Symmetric matrices (..., 3, 3) as (..., 6): xx, xy, xz, yy, yz, zz."""
+    return matrices[..., _ROW, _COLUMN]
+
+
+def unpack(terms: Array) -> Array:
+    """Six terms (..., 6) as symmetric matrices (..., 3, 3)."""
+    out = np.empty((*terms.shape[:-1], 3, 3))
+    out[..., _ROW, _COLUMN] = terms
+    out[..., _COLUMN, _ROW] = terms
+    return out
+
+
+def symmetric_sqrt(matrices: Array) -> Array:
+    """Symmetric positive semidefinite square roots of (..., 3, 3); negative eigenvalues of rounding count as 0."""
+    values, vectors = np.linalg.eigh(matrices)
+    roots = np.sqrt(np.maximum(values, 0.0))
+    return np.einsum("...ik,...k,...jk->...ij", vectors, roots, vectors)
+
+
+def squared_distance(difference: Array, covariance: Array) -> Array:
+    """Squared Mahalanobis distances (...,) of differences (..., k) under covariances (..., k, k)."""
+    try:
+        solved = np.linalg.solve(covariance, difference[..., None])[..., 0]
+    except np.linalg.LinAlgError as error:
+        raise BsmapError("a covariance is singular where a distance is measured by it") from error
+    return np.einsum("...k,...k->...", difference, solved)
+
+
+def product(a: Array, a_covariance: Array, b: Array, b_covariance: Array) -> tuple[Array, Array]:
+    """Product of two Gaussian densities, Eq. (37-38): means (..., k), covariances (..., k, k)."""
+    gain = np.swapaxes(np.linalg.solve(a_covariance + b_covariance, a_covariance), -1, -2)
+    mean = a + np.einsum("...ij,...j->...i", gain, b - a)
+    covariance = a_covariance - gain @ a_covariance
+    return mean, (covariance + np.swapaxes(covariance, -1, -2)) / 2

@@ -1,0 +1,57 @@
+"""Poses in the plane: (x, y, theta), metres and radians; `compose(a, b)` is a, then b in a's frame (a "plus" b)."""
+
+import numpy as np
+
+from bsmap_cli.model import Array, IntArray
+
+
+def wrap(angle: Array) -> Array:
+    """Angle in [-pi, pi)."""
+    return (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi
+
+
+def compose(a: Array, b: Array) -> Array:
+    """Pose(s) (..., 3) of b's frame in the frame in which a is given; theta wrapped."""
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    x = a[..., 0] + c * b[..., 0] - s * b[..., 1]
+    y = a[..., 1] + s * b[..., 0] + c * b[..., 1]
+    return np.stack([x, y, wrap(a[..., 2] + b[..., 2])], axis=-1)
+
+
+def between(a: Array, b: Array) -> Array:
+    """Pose(s) (..., 3) of b in the frame of a: compose(a, between(a, b)) = b."""
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    dx, dy = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
+    return np.stack([c * dx + s * dy, c * dy - s * dx, wrap(b[..., 2] - a[..., 2])], axis=-1)
+
+
+def compose_jacobians(a: Array, b: Array) -> tuple[Array, Array]:
+    """Derivatives (3, 3) of compose(a, b) by a and by b (Smith, Self, Cheeseman 1990)."""
+    c, s = np.cos(a[2]), np.sin(a[2])
+    by_a = np.array([[1.0, 0.0, -s * b[0] - c * b[1]], [0.0, 1.0, c * b[0] - s * b[1]], [0.0, 0.0, 1.0]])
+    by_b = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return by_a, by_b
+
+
+def transform(pose: Array, points: Array) -> Array:
+    """Points (..., 2) from the frame at `pose` (..., 3) into the frame in which the pose is given."""
+    c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
+    x, y = points[..., 0], points[..., 1]
+    return np.stack([pose[..., 0] + c * x - s * y, pose[..., 1] + s * x + c * y], axis=-1)
+
+
+def from_matrix(mount: Array) -> Array:
+    """Planar pose (3,) of a (4, 4) transform that turns about z only."""
+    return np.array([mount[0, 3], mount[1, 3], np.arctan2(mount[1, 0], mount[0, 0])])
+
+
+def interpolate(time_ns: IntArray, poses: Array, at_ns: IntArray) -> Array:
+    """Poses (k, 3) at times `at_ns` (k,), linear in x, y and unwrapped theta; outside, the first or last pose.
+
+    time_ns : (n,) ascending.  poses : (n, 3).
+    """
+    origin = time_ns[0]
+    t, at = (time_ns - origin).astype(float), (at_ns - origin).astype(float)
+    theta = np.unwrap(poses[:, 2])
+    out = [np.interp(at, t, poses[:, 0]), np.interp(at, t, poses[:, 1]), wrap(np.interp(at, t, theta))]
+    return np.stack(out, axis=-1)

@@ -1,0 +1,66 @@
+"""Covariance of a B-spline surface from that of its control points, Eq. (33) and (37)."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from bsmap_cli.core.bspline import basis_functions, evaluate_surface
+from bsmap_cli.core.gaussian import symmetric_sqrt, unpack
+from bsmap_cli.model import Array, BSplineSurface, PosePart
+
+CHUNK = 2048
+
+
+def pose_covariance(pose: Sequence[PosePart], points: Array) -> Array:
+    """Covariance (..., 3, 3) in map that points (..., 3) have from the pose parts of their surface.
+
+    sum w^2 J C J' with J = [[1, 0, -(y - c_y)], [0, 1, x - c_x], [0, 0, 0]]: the shares of the data sets are
+    weighted means, their pose errors independent (an approximation: sets one after another share some drift).
+    """
+    total = np.zeros((*points.shape, 3))
+    for part in pose:
+        J = np.zeros((*points.shape, 3))
+        J[..., 0, 0] = J[..., 1, 1] = 1.0
+        J[..., 0, 2] = part.centre[1] - points[..., 1]
+        J[..., 1, 2] = points[..., 0] - part.centre[0]
+        total += part.weight**2 * (J @ part.covariance @ np.swapaxes(J, -1, -2))
+    return total
+
+
+def sensor_covariance(surface: BSplineSurface, u: ArrayLike, v: ArrayLike) -> Array:
+    """Sensor part B C_P B' of the covariance (n, 3, 3) at scattered parameters u, v (n,), Eq. (37)."""
+    u, v = np.asarray(u, dtype=float), np.asarray(v, dtype=float)
+    roots = symmetric_sqrt(unpack(surface.covariance.blocks))
+    result = np.empty((len(u), 3, 3))
+    for start in range(0, len(u), CHUNK):
+        part = slice(start, start + CHUNK)
+        result[part] = _sensor_chunk(surface, roots, u[part], v[part])
+    return result
+
+
+def _sensor_chunk(surface: BSplineSurface, roots: Array, u: Array, v: Array) -> Array:
+    """sum over local i, j, k, l of  M_ij rho_u[i, k] rho_v[j, l] M_kl'  with  M_ij = N_i N_j L_ij."""
+    first_u, basis_u = basis_functions(surface.knots_u, surface.degree_u, u)
+    first_v, basis_v = basis_functions(surface.knots_v, surface.degree_v, v)
+    i = first_u[:, None] + np.arange(surface.degree_u + 1)
+    j = first_v[:, None] + np.arange(surface.degree_v + 1)
+    rho_u = surface.covariance.correlation_u[i[:, :, None], i[:, None, :]]
+    rho_v = surface.covariance.correlation_v[j[:, :, None], j[:, None, :]]
+    weights = basis_u[:, 0, :, None] * basis_v[:, 0, None, :]
+    M = weights[..., None, None] * roots[i[:, :, None], j[:, None, :]]
+    n, k, m = weights.shape
+    spread = (rho_u @ M.reshape(n, k, -1)).reshape(n, k, m, 9)
+    spread = (rho_v[:, None] @ spread).reshape(n, k * m, 3, 3)
+    return np.einsum("nkab,nkcb->nac", M.reshape(n, k * m, 3, 3), spread)
+
+
+def surface_covariance(surface: BSplineSurface, u: ArrayLike, v: ArrayLike) -> Array:
+    """Covariance (n, 3, 3) in map of the surface's points at scattered parameters: sensor and pose part, Eq. (37)."""
+    return sensor_covariance(surface, u, v) + pose_covariance(surface.covariance.pose, evaluate_surface(surface, u, v))
+
+
+def control_point_covariances(surface: BSplineSurface) -> Array:
+    """Covariance (nu, nv, 3, 3) in map of each control point, sensor and pose part, Eq. (33)."""
+    blocks = unpack(surface.covariance.blocks)
+    return blocks + pose_covariance(surface.covariance.pose, surface.control_points)

@@ -37,7 +37,7 @@ __all__ = [
     "restrict",
 ]
 
-CHUNK = 4096
+CHUNK = 2048
 """Points evaluated at a time: their control points fit into the processor's cache."""
 
 PARTIALS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
@@ -92,24 +92,25 @@ def basis_functions(
 
 def _basis(knots: Array, degree: int, spans: NDArray[np.intp], u: Array, derivatives: int) -> Array:
     """(derivatives + 1, degree + 1, n): values with the long axis last, where numpy is fastest."""
-    levels = cox_de_boor(knots, degree, spans, [u] * degree)
+    levels, inverse_widths = cox_de_boor(knots, degree, spans, [u] * degree)
     values = np.zeros((derivatives + 1, degree + 1, len(u)))
     values[0] = levels[degree]
     for d in range(1, min(derivatives, degree) + 1):
         lower = levels[degree - d]
         for k in range(degree - d + 1, degree + 1):
-            lower = _derivative(knots, k, spans, lower)
+            lower = _derivative(k, lower, inverse_widths[k - 1])
         values[d] = lower
     return values
 
 
-def _derivative(knots: Array, k: int, spans: NDArray[np.intp], lower: Array) -> Array:
+def _derivative(k: int, lower: Array, inverse_widths: Array) -> Array:
     """Derivatives (k + 1, n) of the functions of degree k from values (k, n) of those of degree k - 1."""
-    result = np.zeros((k + 1, lower.shape[1]))
-    for r in range(k):
-        slope = k * lower[r] / (knots[spans + r + 1] - knots[spans + r + 1 - k])
-        result[r] -= slope
-        result[r + 1] = slope
+    slopes = lower * inverse_widths
+    slopes *= k
+    result = np.empty((k + 1, slopes.shape[1]))
+    np.negative(slopes, out=result[:k])
+    result[k] = 0.0
+    result[1:] += slopes
     return result
 
 
@@ -177,7 +178,7 @@ def _evaluate_chunk(
     nv = planes.shape[2]
     corner = (spans_u - p) * nv + (spans_v - q)
     offsets = (np.arange(p + 1)[:, None] * nv + np.arange(q + 1)).ravel()
-    local = planes.reshape(len(planes), -1)[:, corner + offsets[:, None]]  # (d, (p+1)(q+1), n)
+    local = planes.reshape(len(planes), -1).take(corner + offsets[:, None], axis=1)  # (d, (p+1)(q+1), n)
     local = local.reshape(len(planes), p + 1, q + 1, len(u))
     along_v = [np.einsum("dijn,jn->din", local, basis_v[order]) for order in range(highest + 1)]
     for row, (order_u, order_v) in enumerate(partials):

@@ -53,8 +53,18 @@ def find_spans(knots: Array, degree: int, u: Array) -> NDArray[np.intp]:
     return np.searchsorted(inner_knots(knots, degree), u, side="right") + degree
 
 
-def cox_de_boor(knots: Array, degree: int, spans: NDArray[np.intp], arguments: list[Array]) -> list[Array]:
-    """Triangle of Cox and de Boor: the functions of degree 0, 1, ..., `degree` that live on each span.
+class Triangle(NamedTuple):
+    """Triangle of Cox and de Boor: levels[k] (k + 1, n), k = 0 ... degree, holds the functions of degree k.
+
+    inverse_widths[k - 1] (k, n) are the reciprocals of the supports of the k functions of degree k - 1.
+    """
+
+    levels: list[Array]
+    inverse_widths: list[Array]
+
+
+def cox_de_boor(knots: Array, degree: int, spans: NDArray[np.intp], arguments: list[Array]) -> Triangle:
+    """Functions of degree 0, 1, ..., `degree` that live on each span; row r of level k is function spans - k + r.
 
     Level k is evaluated at arguments[k - 1]. Equal arguments at all levels give the basis functions (Eq. 20); the
     knots of a refined vector give its discrete B-splines (Oslo algorithm).
@@ -64,22 +74,22 @@ def cox_de_boor(knots: Array, degree: int, spans: NDArray[np.intp], arguments: l
     knots : (m,)
     spans : (n,) index of the span of each evaluation.
     arguments : `degree` arrays (n,).
-
-    Returns
-    -------
-    list of arrays (k + 1, n), k = 0 ... degree; row r belongs to function number spans - k + r.
     """
-    levels = [np.ones((1, len(spans)))]
+    n = len(spans)
+    # take() is several times faster than indexing; row i holds the knots spans + 1 - degree + i.
+    local = knots.take(spans + np.arange(1 - degree, degree + 1)[:, None])
+    levels, inverse_widths = [np.ones((1, n))], []
     for k in range(1, degree + 1):
-        t, lower = arguments[k - 1], levels[-1]
-        values = np.zeros((k + 1, len(spans)))
-        for r in range(k):
-            left, right = knots[spans + r + 1 - k], knots[spans + r + 1]
-            ratio = lower[r] / (right - left)
-            values[r] += (right - t) * ratio
-            values[r + 1] = (t - left) * ratio
+        t, left, right = arguments[k - 1], local[degree - k : degree], local[degree : degree + k]
+        inverse = 1.0 / (right - left)
+        ratio = levels[-1] * inverse
+        values = np.empty((k + 1, n))
+        np.multiply(right - t, ratio, out=values[:k])
+        values[k] = 0.0
+        values[1:] += (t - left) * ratio
         levels.append(values)
-    return levels
+        inverse_widths.append(inverse)
+    return Triangle(levels, inverse_widths)
 
 
 def insert_knots(knots: Array, degree: int, new_knots: ArrayLike) -> Refined:
@@ -122,7 +132,7 @@ def _refinement_matrix(knots: Array, degree: int, refined: Array) -> Array:
     n_new, n_old = len(refined) - degree - 1, len(knots) - degree - 1
     rows = np.arange(n_new)
     spans = find_spans(knots, degree, refined[:n_new])
-    values = cox_de_boor(knots, degree, spans, [refined[rows + k] for k in range(1, degree + 1)])[-1]
+    values = cox_de_boor(knots, degree, spans, [refined[rows + k] for k in range(1, degree + 1)]).levels[-1]
     matrix = np.zeros((n_new, n_old))
     for r in range(degree + 1):
         matrix[rows, spans - degree + r] = values[r]

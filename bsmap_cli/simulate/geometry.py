@@ -84,7 +84,7 @@ def upright(line: Array, z0: float, z1: float) -> Mesh:
     low = np.column_stack([line, np.full(n, z0)])
     high = np.column_stack([line, np.full(n, z1)])
     i = np.arange(n - 1)
-    return Mesh(np.concatenate([low, high]), _split(np.column_stack([i + 1, i, i + n, i + 1 + n])))
+    return Mesh(np.concatenate([low, high]), _split(np.column_stack([i, i + 1, i + 1 + n, i + n])))
 
 
 def arc(centre: tuple[float, float], radius: float, start: float, stop: float, step: float = np.radians(0.5)) -> Array:

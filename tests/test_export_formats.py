@@ -74,6 +74,14 @@ def test_ply_is_read_by_trimesh(room, meshes):
     assert_same_triangles(mesh.triangles, triangle_soup(meshes), 1e-6)
 
 
+@pytest.mark.parametrize("length", [100, 3000])
+def test_ply_has_no_line_too_long_for_open3d(room, length):
+    provenance = PROVENANCE.to_dict() | {"figures": {"decisions": "x" * length}}
+    header = export_map(room, "ply", provenance=provenance).split(b"end_header\n")[0]
+    assert max(len(line) for line in header.splitlines()) < 1024
+    assert FINGERPRINT.encode() in header
+
+
 def test_stl_holds_the_triangles(room, meshes):
     mesh = trimesh.load(io.BytesIO(exported(room, "stl")), file_type="stl", process=False)
     assert_same_triangles(mesh.triangles, triangle_soup(meshes), 1e-6)

@@ -9,7 +9,7 @@ from bsmap_cli.core.bspline import TensorSpline
 from bsmap_cli.errors import BsmapError
 from bsmap_cli.evaluate import align, distance_to_mesh, fit_pose, summary, surface_samples, transform_points
 from bsmap_cli.model import Trajectory
-from bsmap_cli.simulate.geometry import carve, room
+from bsmap_cli.simulate.geometry import arc, carve, room, upright
 
 
 def trajectory(time_ns, poses):
@@ -76,6 +76,25 @@ def test_distances_to_a_box_are_those_of_geometry_far_from_the_origin():
 def test_distance_outside_counts_to_the_nearest_corner():
     mesh = carve([room(0, 1, 0, 1, 0, 1)])
     np.testing.assert_allclose(distance_to_mesh(np.array([[2.0, 3.0, 3.0]]), *mesh), [3.0], atol=1e-6)
+
+
+def test_distances_agree_with_a_slow_twin():
+    rng = np.random.default_rng(5)
+    corners, points = rng.uniform(0, 1, (20, 3, 3)), rng.uniform(-0.5, 1.5, (40, 3))
+    a, b = (g.ravel() for g in np.meshgrid(*2 * [np.linspace(0, 1, 201)]))
+    weights = np.column_stack([1 - a - b, a, b])[a + b <= 1 + 1e-12]
+    on_triangles = (weights @ corners).reshape(-1, 3)
+    expected = [np.linalg.norm(on_triangles - p, axis=1).min() for p in points]
+    found = distance_to_mesh(points, corners.reshape(-1, 3), np.arange(60).reshape(-1, 3))
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+    assert np.all(found <= np.array(expected) + 1e-9)
+
+
+def test_distance_is_exact_at_long_thin_triangles():
+    mesh = upright(arc((20.0, 3.0), 0.25, 0.0, 2 * np.pi, np.radians(2.0)), 0.0, 3.2)
+    weights = np.random.default_rng(2).dirichlet([1, 1, 1], (len(mesh.triangles), 5))
+    points = np.einsum("mki,mij->mkj", weights, mesh.vertices[mesh.triangles]).reshape(-1, 3)
+    assert distance_to_mesh(points, *mesh).max() < 1e-5
 
 
 def test_summary_of_known_distances():

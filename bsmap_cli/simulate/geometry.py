@@ -10,6 +10,8 @@ import numpy as np
 
 from bsmap_cli.model import Array, IntArray
 
+LAYER_HEIGHT = 0.2  # m
+
 
 class Mesh(NamedTuple):
     """Vertices (n, 3), metres in the scene frame, and triangles (m, 3) of vertex indices."""
@@ -79,12 +81,15 @@ def _walls_across(axis: int, free: np.ndarray, planes: list[Array]) -> Array:
 
 
 def upright(line: Array, z0: float, z1: float) -> Mesh:
-    """Wall from z0 to z1 over a polyline (n, 2), its free side to the right of the way along the line."""
-    n = len(line)
-    low = np.column_stack([line, np.full(n, z0)])
-    high = np.column_stack([line, np.full(n, z1)])
-    i = np.arange(n - 1)
-    return Mesh(np.concatenate([low, high]), _split(np.column_stack([i, i + 1, i + 1 + n, i + n])))
+    """Wall from z0 to z1 over a polyline (n, 2), its free side to the right of the way along the line.
+
+    It is made in layers of at most LAYER_HEIGHT: queries in float32 err at long thin triangles.
+    """
+    heights = np.linspace(z0, z1, int(np.ceil((z1 - z0) / LAYER_HEIGHT)) + 1)
+    n, m = len(line), len(heights)
+    vertices = np.column_stack([np.tile(line, (m, 1)), np.repeat(heights, n)])
+    first = (np.arange(m - 1)[:, None] * n + np.arange(n - 1)).ravel()
+    return Mesh(vertices, _split(np.column_stack([first, first + 1, first + 1 + n, first + n])))
 
 
 def arc(centre: tuple[float, float], radius: float, start: float, stop: float, step: float = np.radians(0.5)) -> Array:

@@ -66,7 +66,8 @@ def odometry(path: Path, time: Array, error: float, rng: np.random.Generator) ->
     Systematic errors (wheels' radii, wheel base) are drawn once; random ones grow with the square root of the way.
     """
     scale = 1 + error * (SCALE_SIGMA * rng.standard_normal() + WHEEL_DIFFERENCE_SIGMA * rng.standard_normal(2) / 2**0.5)
-    wheel_base = WHEEL_BASE * (1 + error * WHEEL_BASE_SIGMA * rng.standard_normal())
+    # Robots are calibrated by turning on the spot, which finds the wheel base as a multiple of the assumed radius.
+    wheel_base = WHEEL_BASE * scale.mean() * (1 + error * WHEEL_BASE_SIGMA * rng.standard_normal())
     # Steps end where the motion changes too: within each, both wheels turn evenly and the arc is exact.
     inside = path.time[(path.time > time[0]) & (path.time < time[-1])]
     t = np.union1d(time, inside)

@@ -76,8 +76,18 @@ class Provenance:
         )
 
 
+def _plain(value: Any) -> Any:
+    """As JSON knows it: numpy's scalars become Python's, what is not finite becomes a word ("inf")."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    scalar = value.item() if hasattr(value, "item") else value
+    return str(scalar) if isinstance(scalar, float) and not math.isfinite(scalar) else scalar
+
+
 def plain_parameters(*params: Any) -> dict[str, Any]:
-    """One dict of the fields of parameter dataclasses, in their order; infinity, unknown to JSON, becomes "inf".
+    """One dict of the fields of parameter dataclasses, in their order, as JSON knows them.
 
     Raises ValueError where two classes share a field's name.
     """
@@ -87,9 +97,7 @@ def plain_parameters(*params: Any) -> dict[str, Any]:
         if twice := merged.keys() & fields.keys():
             raise ValueError(f"parameters given twice: {sorted(twice)}")
         merged |= fields
-    return {
-        key: str(value) if isinstance(value, float) and math.isinf(value) else value for key, value in merged.items()
-    }
+    return {key: _plain(value) for key, value in merged.items()}
 
 
 def make_provenance(stage: str, parameters: Mapping[str, Any], inputs: Sequence[Path | str]) -> Provenance:
@@ -141,7 +149,7 @@ def atomic_output(path: Path | str) -> Iterator[Path]:
         The file cannot be written, or `path` is a directory or a device.
     """
     target = Path(os.path.realpath(path))
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
+    temporary = target.with_name(f".{os.getpid()}.part.{target.name}")  # keeps the ending, which tells the format
     try:
         if target.exists() and not stat.S_ISREG(target.stat().st_mode):
             raise CannotWriteError(f"{path}: is not a regular file; name another output")

@@ -155,7 +155,7 @@ def write_log(
 
     Scans go to their `topic`, odometry to /odom (odom -> base_link), `mounts` (frame -> T_base_laser) to /tf_static.
     The time of logging is the stamp where stamps ascend; where they step back it goes on by a nanosecond, so that
-    the order of the rows is the order of the log. Rows of one stamp that follow each other share it.
+    the order of the rows is the order of the log. A scan shares it with the odometry of its stamp right before it.
 
     Raises
     ------
@@ -165,7 +165,7 @@ def write_log(
     count, stamp, log_time = 0, -1, -1
     with ros_writer(path, provenance) as writer:
         for row in rows:
-            if row.time_ns != stamp:
+            if row.time_ns != stamp or isinstance(row, OdometryRow):
                 stamp, log_time = row.time_ns, max(row.time_ns, log_time + 1)
             if not count:
                 _write_mounts(writer, mounts, stamp)

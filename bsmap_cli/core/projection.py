@@ -47,7 +47,7 @@ class Projection(NamedTuple):
     on_surface: NDArray[np.bool_]
 
 
-class Samples(NamedTuple):
+class SampleGrid(NamedTuple):
     """Points of a surface on a grid of parameters, dense enough that the closest of them mostly starts Newton right.
 
     u : (k,), v : (l,) parameters of the grid.  tree : of its k l points, v fastest.
@@ -62,8 +62,25 @@ class Samples(NamedTuple):
     clearance: Array
 
 
-def sample_surface(surface: Surface) -> tuple[Samples, Samples]:
-    """Fine and coarse samples of a surface; make them once where many batches are projected on the same surface."""
+class Samples(NamedTuple):
+    """Fine samples of a surface, and every third of them."""
+
+    fine: SampleGrid
+    coarse: SampleGrid
+
+    @property
+    def tree(self) -> cKDTree:
+        """Of the fine samples, for neighbours of other kinds."""
+        return self.fine.tree
+
+    @property
+    def reach(self) -> Array:
+        """(m,) metres, diagonal of the widest cell around each fine sample."""
+        return self.fine.reach
+
+
+def sample_surface(surface: Surface) -> Samples:
+    """Samples of a surface; make them once where many batches are projected on the same surface."""
     spans = [
         _span_lengths(surface.knots_u, surface.degree_u, surface.control_points),
         _span_lengths(surface.knots_v, surface.degree_v, np.swapaxes(surface.control_points, 0, 1)),
@@ -73,24 +90,30 @@ def sample_surface(surface: Surface) -> tuple[Samples, Samples]:
     v = _divide(*spans[1], spacing, surface.degree_v)
     points = evaluate_grid(surface, u, v)
     i, j = _every_third(len(u)), _every_third(len(v))
-    return _samples(u, v, points), _samples(u[i], v[j], points[np.ix_(i, j)])
+    return Samples(_sample_grid(u, v, points), _sample_grid(u[i], v[j], points[np.ix_(i, j)]))
 
 
 def _every_third(count: int) -> NDArray[np.intp]:
     return np.unique(np.append(np.arange(0, count, 3), count - 1))
 
 
-def _samples(u: Array, v: Array, points: Array) -> Samples:
+def _sample_grid(u: Array, v: Array, points: Array) -> SampleGrid:
     legs = [np.linalg.norm(np.diff(points, axis=axis), axis=2) for axis in (0, 1)]
     widest_u = np.maximum(np.pad(legs[0], ((1, 0), (0, 0))), np.pad(legs[0], ((0, 1), (0, 0))))
     widest_v = np.maximum(np.pad(legs[1], ((0, 0), (1, 0))), np.pad(legs[1], ((0, 0), (0, 1))))
     flat = points.reshape(-1, 3)
     tree = cKDTree(flat, balanced_tree=False, compact_nodes=False)
-    distance, near = tree.query(flat, k=10)
+    distance, near = _nearest(tree, flat, 10)
     # Where the nine nearest are all neighbours, the distance to the tenth is a lower bound.
     distance[:, :-1][~_apart(near[:, :-1], np.arange(len(flat))[:, None], len(v), len(flat))] = np.inf
     clearance = distance.min(axis=1)
-    return Samples(u, v, tree, np.hypot(widest_u, widest_v).ravel(), clearance)
+    return SampleGrid(u, v, tree, np.hypot(widest_u, widest_v).ravel(), clearance)
+
+
+def _nearest(tree: cKDTree, points: Array, k: int) -> tuple[Array, NDArray[np.intp]]:
+    """Distances and indices of the k nearest: (n,) for k = 1, (n, k) for more; index n_samples where there are less."""
+    distance, index = tree.query(points, k=k)
+    return np.asarray(distance), np.asarray(index)
 
 
 def _apart(first: NDArray[np.intp], second: NDArray[np.intp], width: int, count: int) -> NDArray[np.bool_]:
@@ -118,7 +141,7 @@ def _divide(ends: Array, lengths: Array, spacing: float, least: int) -> Array:
     return np.concatenate([*steps, [1.0]])
 
 
-def project(surface: Surface, points: Array, samples: tuple[Samples, Samples] | None = None) -> Projection:
+def project(surface: Surface, points: Array, samples: Samples | None = None) -> Projection:
     """Nearest points of a surface, Eq. (34-36).
 
     Parameters
@@ -134,13 +157,13 @@ def project(surface: Surface, points: Array, samples: tuple[Samples, Samples] | 
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"points have shape {points.shape}, wanted (n, 3)")
     fine, coarse = sample_surface(surface) if samples is None else samples
-    start_distance, start = fine.tree.query(points)
+    start_distance, start = _nearest(fine.tree, points, 1)
     found = _descend(surface, points, *_parameters(fine, start))
     distance = np.sqrt(_squared(found.jets[0] - points))
     room = np.maximum(fine.clearance[start] - start_distance, 0.0)
     doubtful = np.flatnonzero(room**2 - (OFFSET * fine.reach[start]) ** 2 < distance**2)
-    for samples_ in (fine, coarse):
-        _try_other_starts(surface, points, samples_, doubtful, found)
+    for grid in (fine, coarse):
+        _try_other_starts(surface, points, grid, doubtful, found)
     return _as_projection(surface, points, found)
 
 
@@ -217,12 +240,12 @@ def _dot(a: Array, b: Array) -> Array:
     return np.einsum("nk,nk->n", a, b)
 
 
-def _parameters(samples: Samples, index: NDArray[np.intp]) -> tuple[Array, Array]:
+def _parameters(samples: SampleGrid, index: NDArray[np.intp]) -> tuple[Array, Array]:
     return samples.u[index // len(samples.v)], samples.v[index % len(samples.v)]
 
 
 def _try_other_starts(
-    surface: Surface, points: Array, samples: Samples, doubtful: NDArray[np.intp], found: _State
+    surface: Surface, points: Array, samples: SampleGrid, doubtful: NDArray[np.intp], found: _State
 ) -> None:
     """Descend again from samples that may lie above a nearer foot than the one found; keep the nearer.
 
@@ -231,7 +254,7 @@ def _try_other_starts(
     if not len(doubtful):
         return
     count = len(samples.reach)
-    distance, near = samples.tree.query(points[doubtful], k=min(STARTS, count))
+    distance, near = _nearest(samples.tree, points[doubtful], min(STARTS, count))
     u, v = found.uv[:, doubtful]
     here = np.searchsorted((samples.u[1:] + samples.u[:-1]) / 2, u) * len(samples.v)
     here += np.searchsorted((samples.v[1:] + samples.v[:-1]) / 2, v)

@@ -1,0 +1,62 @@
+"""Banded linear least squares: rows with few neighbouring nonzeros, as B-spline basis functions give them.
+
+A design matrix N is held as (first, values): row k is nonzero in the columns first[k] ... first[k] + b - 1 only. Then
+N'N has b - 1 bands beside the diagonal, and so has its Cholesky factor. Several problems that share no column stand in
+one system, block after block: it stays banded, and one factorisation serves them all.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
+
+from bsmap_cli.errors import BsmapError
+from bsmap_cli.model import Array
+
+
+def normal_matrix(first: NDArray[np.intp], values: Array, columns: int) -> Array:
+    """Lower bands (b, columns) of N'N: element [d, j] is (N'N)[j + d, j].
+
+    Parameters
+    ----------
+    first : (n,) first column that is not zero in each row.  values : (n, b).
+    """
+    width = values.shape[1]
+    bands = np.zeros((width, columns))
+    for r in range(width):
+        for d in range(width - r):
+            bands[d] += np.bincount(first + r, values[:, r] * values[:, r + d], columns)
+    return bands
+
+
+def right_side(first: NDArray[np.intp], values: Array, data: Array, columns: int) -> Array:
+    """N' Q, (columns, k), of data Q (n, k)."""
+    result = np.empty((columns, data.shape[1]))
+    for k, column in enumerate(data.T):
+        result[:, k] = sum(np.bincount(first + r, values[:, r] * column, columns) for r in range(values.shape[1]))
+    return result
+
+
+def factorise(normal: Array) -> Array:
+    """Cholesky factor, lower bands (b, columns), of a normal matrix.
+
+    Raises
+    ------
+    BsmapError
+        Where the matrix is not positive definite: some unknown has too few data (Schoenberg-Whitney).
+    """
+    try:
+        return cholesky_banded(normal, lower=True)
+    except LinAlgError as error:
+        message = f"least squares with {normal.shape[1]} unknowns is underdetermined: a knot span lacks data"
+        raise BsmapError(message) from error
+
+
+def solve(factor: Array, right: Array) -> Array:
+    """Solution (columns, k) of N'N X = right by the factor of `factorise`."""
+    return cho_solve_banded((factor, True), right)
+
+
+def fit(first: NDArray[np.intp], values: Array, data: Array, columns: int) -> tuple[Array, Array]:
+    """Least-squares solution (columns, k) of N X = data (n, k), and the factor of N'N for more."""
+    factor = factorise(normal_matrix(first, values, columns))
+    return solve(factor, right_side(first, values, data, columns)), factor

@@ -41,17 +41,18 @@ class McapMessage(NamedTuple):
     data: bytes
 
 
-def read_messages(path: Path | str) -> Iterator[McapMessage]:
+def read_messages(path: Path | str, *, whole: bool = False) -> Iterator[McapMessage]:
     """Messages of an MCAP file in the order of the file.
 
-    Of a damaged or cut file, the messages that can be had are given, and a warning with their number is logged.
+    Of a damaged or cut file, the messages that can be had are given, and a warning with their number is logged; with
+    `whole` it is refused, at the end.
 
     Raises
     ------
     MissingInputError
         There is no such file.
     BadInputError
-        It is not an MCAP file, or not one message could be read.
+        It is not an MCAP file, or not one message could be read, or it is damaged and should be whole.
     """
     path, count, damage = Path(path), 0, [""]
     _check_magic(path)
@@ -65,6 +66,8 @@ def read_messages(path: Path | str) -> Iterator[McapMessage]:
         elif isinstance(record, Message) and record.channel_id in channels:
             count += 1
             yield McapMessage(*channels[record.channel_id], record.log_time, record.data)
+    if damage[0] and whole:
+        raise BadInputError(f"{path}: {damage[0]}; make it again")
     if damage[0] and count:
         logger.warning("%s: %s; the %d messages that could be read are used", path, damage[0], count)
     elif not count:

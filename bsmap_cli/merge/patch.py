@@ -1,0 +1,148 @@
+"""Pieces of surfaces: cutting them along iso-parametric lines without changing their shape."""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bsmap_cli.core.bspline import evaluate_grid, restrict
+from bsmap_cli.core.projection import Samples, project, sample_surface
+from bsmap_cli.merge.covariance import carry
+from bsmap_cli.merge.facing import Facing, visible_normals, visible_side
+from bsmap_cli.model import Array, BSplineSurface
+
+OVERHANG = 0.02
+"""Metres a point may lie outside a patch's edge and still count as on it: edges of patches are known no better."""
+
+
+class Window(NamedTuple):
+    """Rectangle of the parameter domain."""
+
+    u0: float
+    u1: float
+    v0: float
+    v1: float
+
+
+WHOLE = Window(0.0, 1.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A surface on its way into the map, with what the search for overlaps needs at hand.
+
+    box : (2, 3) lowest and highest coordinates of the control points; they enclose the surface.
+    size : lengths along u and v in metres, means over the other direction.
+    root : name of the surfaces of which it is a piece.
+    """
+
+    surface: BSplineSurface
+    facing: Facing
+    root: str
+    samples: Samples
+    box: Array
+    size: tuple[float, float]
+
+
+class Landing(NamedTuple):
+    """Points projected on a patch.
+
+    u, v : (n,) parameters of the feet.  foot, normal : (n, 3), the normal on the visible side.
+    hit : (n,) bool, near enough, on the patch and seen from the same side.
+    opposite : (n,) bool, near enough, on the patch, but seen from the other side.
+    """
+
+    u: Array
+    v: Array
+    foot: Array
+    normal: Array
+    hit: NDArray[np.bool_]
+    opposite: NDArray[np.bool_]
+
+
+def make_patch(surface: BSplineSurface, facing: Facing | None = None, root: str = "") -> Patch:
+    """Patch of a surface; without `facing` its visible side is found from its data sets' centres."""
+    samples = sample_surface(surface)
+    facing = visible_side(surface) if facing is None else facing
+    corners = surface.control_points.reshape(-1, 3)
+    box = np.stack([corners.min(axis=0), corners.max(axis=0)])
+    return Patch(surface, facing, root or surface.name, samples, box, _size(surface))
+
+
+def _size(surface: BSplineSurface) -> tuple[float, float]:
+    points = evaluate_grid(surface, np.linspace(0.0, 1.0, 33), np.linspace(0.0, 1.0, 33))
+    return float(_lengths(points, 0).sum()), float(_lengths(points, 1).sum())
+
+
+def _lengths(points: Array, axis: int) -> Array:
+    """Mean lengths of the steps of a grid of points (n, m, 3) along an axis."""
+    steps: Array = np.linalg.norm(np.diff(points, axis=axis), axis=2)
+    return steps.mean(axis=1 - axis)
+
+
+def width(patch: Patch, axis: int, a: float, b: float) -> float:
+    """Mean length in metres of the strip from parameter a to b along an axis (0: u, 1: v)."""
+    if b <= a:
+        return 0.0
+    across, along = np.linspace(0.0, 1.0, 33), np.linspace(a, b, 17)
+    u, v = (along, across) if axis == 0 else (across, along)
+    return float(_lengths(evaluate_grid(patch.surface, u, v), axis).sum())
+
+
+def land(points: Array, normals: Array, target: Patch, distance: float) -> Landing:
+    """Project points on a patch, section 9; only those whose nearest sample is near enough are worth a Newton step.
+
+    Parameters
+    ----------
+    points, normals : (n, 3), the normals on the side from which the points are seen; zero: seen from any side.
+    distance : metres, largest distance to a foot.
+    """
+    n = len(points)
+    u, v, foot, normal = np.zeros(n), np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3))
+    on, same = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
+    grid = target.samples.fine
+    gap, nearest = grid.tree.query(points, distance_upper_bound=distance + float(grid.reach.max()))
+    close = np.flatnonzero(np.asarray(gap) <= distance + np.append(grid.reach, 0.0)[nearest])
+    if len(close):
+        found = project(target.surface, points[close], target.samples)
+        u[close], v[close], foot[close] = found.u, found.v, found.foot
+        normal[close] = visible_normals(target.surface, target.facing, found.u, found.v)
+        r = points[close] - found.foot
+        aside = np.linalg.norm(r - np.einsum("nk,nk->n", r, normal[close])[:, None] * normal[close], axis=1)
+        on[close] = (found.distance <= distance) & (found.on_surface | (aside <= OVERHANG))
+        same[close] = np.einsum("nk,nk->n", normals[close], normal[close]) >= 0.0
+    return Landing(u, v, foot, normal, on & same, on & ~same)
+
+
+def cut(patch: Patch, window: Window, name: str) -> Patch:
+    """Part of a patch over a window, exact by knot insertion; its covariance goes by the same linear map."""
+    surface = patch.surface
+    along_u = restrict(surface.knots_u, surface.degree_u, window.u0, window.u1)
+    along_v = restrict(surface.knots_v, surface.degree_v, window.v0, window.v1)
+    area = width(patch, 0, window.u0, window.u1) * width(patch, 1, window.v0, window.v1)
+    share = area / (patch.size[0] * patch.size[1])
+    piece = replace(
+        surface,
+        name=name,
+        knots_u=along_u.knots,
+        knots_v=along_v.knots,
+        control_points=np.einsum("ia,jb,abk->ijk", along_u.matrix, along_v.matrix, surface.control_points),
+        covariance=carry(surface.covariance, along_u.matrix, along_v.matrix),
+        residuals=replace(surface.residuals, points=round(surface.residuals.points * min(share, 1.0))),
+    )
+    return make_patch(piece, patch.facing.piece(window.u0, window.u1), patch.root)
+
+
+def surroundings(patch: Patch, window: Window) -> list[Window]:
+    """The at most four rectangles around a window, cut so that the cuts are short."""
+    u0, u1, v0, v1 = window
+    across_u = [Window(0.0, u0, 0.0, 1.0), Window(u1, 1.0, 0.0, 1.0), Window(u0, u1, 0.0, v0), Window(u0, u1, v1, 1.0)]
+    across_v = [Window(0.0, 1.0, 0.0, v0), Window(0.0, 1.0, v1, 1.0), Window(0.0, u0, v0, v1), Window(u1, 1.0, v0, v1)]
+    # Full cuts across u are as long as the patch is along v; the short ones span the window.
+    in_u, in_v = int(u0 > 0.0) + int(u1 < 1.0), int(v0 > 0.0) + int(v1 < 1.0)
+    length_u, length_v = patch.size
+    cost_u = in_u * length_v + in_v * (u1 - u0) * length_u
+    cost_v = in_v * length_u + in_u * (v1 - v0) * length_v
+    chosen = across_u if cost_u <= cost_v else across_v
+    return [w for w in chosen if w.u1 > w.u0 and w.v1 > w.v0]

@@ -1,5 +1,6 @@
 """Errors against known truth: trajectories after alignment, points and surfaces against the scene's mesh."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -8,7 +9,7 @@ from bsmap_cli import open3d_loader
 from bsmap_cli.core import se2
 from bsmap_cli.core.bspline import Surface, evaluate_grid
 from bsmap_cli.errors import BsmapError
-from bsmap_cli.model import Array, IntArray, Residuals, SurfaceMap, Trajectory
+from bsmap_cli.model import Array, IntArray, PointCloud, Residuals, SurfaceMap, Trajectory
 
 POINTS_AT_ONCE = 500_000
 COARSE_SAMPLES = 33  # a direction, to measure how long a surface is
@@ -123,3 +124,46 @@ def _even_parameters(coarse: Array, lines: Array, step: float) -> Array:
     count = max(2, int(np.ceil(lengths.sum(axis=0).max() / step)) + 1)
     # A surface shrunk to a point has no length to divide evenly.
     return np.interp(np.linspace(0.0, way[-1], count), way, coarse) if way[-1] > 0 else coarse[[0, -1]]
+
+
+class Mesh(NamedTuple):
+    """Scene of known shape. vertices : (n, 3), metres.  triangles : (m, 3)."""
+
+    vertices: Array
+    triangles: IntArray
+
+
+def evaluate_run(
+    trajectory: Trajectory,
+    cloud: PointCloud,
+    maps: Sequence[SurfaceMap],
+    truth: Trajectory,
+    scene: Mesh,
+    step: float,
+) -> dict[str, float]:
+    """Errors of trajectory, cloud, surfaces and merged map (`maps`: both), laid over the scene by the trajectory.
+
+    Surfaces are sampled about every `step` metres. Keys are the rows' names in the report.
+    """
+    aligned = align(trajectory, truth)
+    rows: dict[str, float] = {
+        "trajectory RMS [m]": aligned.rms,
+        "trajectory max [m]": aligned.maximum,
+        "heading RMS [deg]": float(np.degrees(aligned.heading_rms)),
+        "cloud points": len(cloud.points),
+    }
+    samples = {"cloud": cloud.points} | {
+        name: surface_samples(one, step) for name, one in zip(("surfaces", "map"), maps, strict=True)
+    }
+    for name, points in samples.items():
+        error = summary(distance_to_mesh(transform_points(aligned.pose, points), scene.vertices, scene.triangles))
+        rows |= {
+            f"{name} mean [m]": error.mean,
+            f"{name} RMS [m]": error.rms,
+            f"{name} 95% [m]": error.percentile_95,
+            f"{name} max [m]": error.maximum,
+        }
+    for name, one in zip(("surfaces", "map"), maps, strict=True):
+        shapes = [surface.control_points.shape for surface in one.surfaces]
+        rows |= {f"{name}": len(shapes), f"{name} control points": sum(nu * nv for nu, nv, _ in shapes)}
+    return rows

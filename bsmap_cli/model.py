@@ -54,7 +54,7 @@ class LaserScans:
     @property
     def angles(self) -> Array:
         """(m,) beam angles, radians."""
-        return self.angle_min + self.angle_increment * np.arange(self.ranges.shape[1])
+        return self.angle_min + self.angle_increment * np.arange(self.ranges.shape[1], dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -196,8 +196,9 @@ class SurfaceCovariance:
     """Covariance of a surface's control points: a sensor part and the pose parts of its data sets.
 
     Sensor part of control points (i, j) and (k, l):  L_ij (rho_u[i, k] rho_v[j, l]) L_kl',  L the symmetric square
-    roots of `blocks`. The blocks on the diagonal are exact (A C_Q A', Eq. 32-33); the correlation is that of equal noise
-    on all points, which is separable: an approximation that keeps the map small and any point's covariance at hand.
+    roots of `blocks`. The blocks on the diagonal are exact (A C_Q A', Eq. 32-33); the correlation is that of equal
+    noise on all points, which is separable: an approximation that keeps the map small and any point's covariance at
+    hand.
 
     blocks : (nu, nv, 6) xx, xy, xz, yy, yz, zz.  correlation_u : (nu, nu).  correlation_v : (nv, nv).
     """

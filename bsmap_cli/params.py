@@ -4,6 +4,7 @@ Every field is an option of the stage's command: `parameter` gives the help, the
 radians here and degrees on the command line (unit "rad" is converted in cli/options.py).
 """
 
+import math
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -48,12 +49,45 @@ class LogParams(Checked):
 
 
 @dataclass(frozen=True)
+class SlamParams(Checked):
+    """Line-segment EKF SLAM, method.md sections 1-4."""
+
+    range_sigma: float | None = parameter(
+        None, "Standard deviation of a range (default: from the log).", "m", 1e-4, 1.0
+    )
+    angle_sigma: float = parameter(0.0005, "Standard deviation of a beam's direction.", "rad", 0.0, 0.1)
+    breakpoint_angle: float = parameter(
+        math.radians(10.0), "Smallest angle of incidence at which neighbouring points still join.", "rad", 0.001, 1.5
+    )
+    split_distance: float = parameter(0.05, "Points farther off their segment's chord split it.", "m", 0.001, 1.0)
+    min_points: int = parameter(6, "Fewest points of a segment.", "", 3)
+    min_length: float = parameter(0.3, "Shortest segment.", "m", 0.01)
+    line_angle_floor: float = parameter(0.002, "Floor of a line's angle error: no wall is flat.", "rad", 0.0, 0.1)
+    line_offset_floor: float = parameter(0.003, "Floor of a line's offset error: no wall is flat.", "m", 0.0, 0.5)
+    odometry_translation: float = parameter(0.1, "Odometry's error in place for each metre driven.", "m", 0.0, 1.0)
+    odometry_rotation: float = parameter(0.1, "Odometry's error in heading for each radian turned.", "", 0.0, 1.0)
+    odometry_coupling: float = parameter(
+        0.03, "Error in heading for each metre, in place for each radian.", "", 0.0, 1.0
+    )
+    acceleration: float = parameter(1.0, "Without odometry: usual change of speed a second (m/s, rad/s).", "", 0.01)
+    gate: float = parameter(0.99, "Share of true pairs that the compatibility tests let pass.", "", 0.5, 0.999999)
+    group_size: int = parameter(4, "Segments in a group of the partial compatibility algorithm.", "", 1, 8)
+    overlap_margin: float = parameter(0.3, "Segments of one wall may lie this far apart along it.", "m", 0.0)
+    tentative_hits: int = parameter(3, "Scans that must see a line before it stays for good.", "", 1)
+    tentative_scans: int = parameter(10, "Key scans after which a line that did not come again is dropped.", "", 1)
+    key_distance: float = parameter(0.02, "Movement below which a scan brings nothing new.", "m", 0.0)
+    key_angle: float = parameter(math.radians(0.5), "Rotation below which a scan brings nothing new.", "rad", 0.0)
+
+
+@dataclass(frozen=True)
 class CloudParams(Checked):
     """Point cloud of the vertical laser, method.md section 5."""
 
     range_min: float = parameter(0.0, "Drop beams shorter than this.", "m", 0.0)
     range_max: float = parameter(float("inf"), "Drop beams longer than this.", "m", 0.0)
-    range_sigma: float = parameter(0.01, "Standard deviation of a range.", "m", 1e-6, 1.0)
+    range_sigma: float | None = parameter(
+        None, "Standard deviation of a range (default: from the log).", "m", 1e-6, 1.0
+    )
     angle_sigma: float = parameter(0.0005, "Standard deviation of a beam's direction.", "rad", 0.0, 0.1)
 
 
@@ -66,6 +100,7 @@ class FitParams(Checked):
     bound_u: float = parameter(0.01, "Largest error allowed along the scan lines.", "m", 1e-4)
     bound_v: float = parameter(0.05, "Largest error allowed across the scan lines.", "m", 1e-4)
     knots_per_pass: int = parameter(1, "Knots inserted before each new fit.", "", 1, 1000)
+    set_length: float = parameter(5.0, "Longest translation fitted with one surface.", "m", 0.1)
 
 
 @dataclass(frozen=True)

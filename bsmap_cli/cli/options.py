@@ -27,8 +27,8 @@ force_option = click.option("--force", is_flag=True, help="Compute even when the
 def input_argument(name: str, many: bool = False) -> Callable[[Command], Command]:
     """Argument for one input file, or for one and more."""
     kind = click.Path(path_type=Path)
-    return click.argument(name.lower(), type=kind, metavar=name + ("..." if many else ""), nargs=-1 if many else 1,
-                          required=True)  # fmt: skip
+    metavar = name + ("..." if many else "")
+    return click.argument(name.lower(), type=kind, metavar=metavar, nargs=-1 if many else 1, required=True)
 
 
 def parameters(*classes: type) -> Callable[[Command], Command]:
@@ -36,12 +36,13 @@ def parameters(*classes: type) -> Callable[[Command], Command]:
 
     def decorate(command: Command) -> Command:
         @wraps(command)
-        def wrapper(**kwargs: Any) -> Any:
+        def with_instances(**kwargs: Any) -> Any:
             for owner in classes:
                 values = {f.name: kwargs.pop(_key(owner, f)) for f in dataclasses.fields(owner)}
                 kwargs[_snake(owner.__name__)] = owner(**values)
             return command(**kwargs)
 
+        wrapper: Command = with_instances
         for owner in reversed(classes):
             hints = typing.get_type_hints(owner)
             for f in reversed(dataclasses.fields(owner)):
@@ -60,7 +61,8 @@ def _key(owner: type, f: "dataclasses.Field[Any]") -> str:
 
 
 def _option(owner: type, f: "dataclasses.Field[Any]", hint: Any) -> Callable[[Command], Command]:
-    meta, default = f.metadata, f.default
+    meta = f.metadata
+    default: Any = f.default
     flag = "--" + (meta["name"] or f.name).replace("_", "-")
     if hint is bool:
         return click.option(f"{flag}/--no-{flag[2:]}", _key(owner, f), default=default, help=meta["help"])
@@ -77,8 +79,8 @@ def _option(owner: type, f: "dataclasses.Field[Any]", hint: Any) -> Callable[[Co
         # The default is handed on untouched: degrees and back would change its last bit.
         return default if value == shown else math.radians(value)
 
-    return click.option(flag, _key(owner, f), type=kind, default=shown, show_default=default is not None, help=help,
-                        callback=convert)  # fmt: skip
+    key, has_default = _key(owner, f), default is not None
+    return click.option(flag, key, type=kind, default=shown, show_default=has_default, help=help, callback=convert)
 
 
 def existing(path: Path) -> Path:

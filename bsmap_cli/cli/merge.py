@@ -1,0 +1,37 @@
+"""bsmap merge: B-spline surfaces of one run or several -> one map."""
+
+from pathlib import Path
+
+import click
+
+from bsmap_cli.cli.options import force_option, input_argument, output_option, parameters
+from bsmap_cli.cli.stage import Result, beside, run_stage
+from bsmap_cli.params import MergeParams
+from bsmap_cli.track import Track
+
+
+@click.command()
+@input_argument("SURFACES_JSON", many=True)
+@output_option
+@parameters(MergeParams)
+@force_option
+def merge(surfaces_json: tuple[Path, ...], output: Path | None, merge_params: MergeParams, force: bool) -> None:
+    """One map: overlaps divided and fused: X.map.json (named by the first input)."""
+    output = output or beside(surfaces_json[0], ".map.json", [".surfaces.json", ".map.json"])
+    make_map_file(surfaces_json, output, merge_params, force)
+
+
+def make_map_file(inputs: tuple[Path, ...], output: Path, merge_params: MergeParams, force: bool) -> None:
+    """The stage's work."""
+
+    def compute(track: Track) -> Result:
+        from bsmap_cli.cli.stage import map_figures
+        from bsmap_cli.io.surfaces_json import read_surfaces, write_surfaces
+        from bsmap_cli.merge import merge_surfaces
+
+        merged = merge_surfaces([read_surfaces(path) for path in inputs], merge_params, track=track)
+        outcomes = [decision.outcome for decision in merged.decisions]
+        figures = {**map_figures(merged), "merged": outcomes.count("merged"), "refused": outcomes.count("refused")}
+        return Result([lambda path, provenance: write_surfaces(path, merged, provenance)], figures)
+
+    run_stage("merge", list(inputs), [output], [merge_params], compute, force)

@@ -1,0 +1,61 @@
+"""Picture of a run: plan of trajectory, lines and cloud; the surfaces before and after merging."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bsmap_cli.core.bspline import evaluate_grid
+from bsmap_cli.model import Array, LineMap, PointCloud, SlamMap, SurfaceMap
+
+MOST_POINTS = 60_000
+
+
+def draw_run(path: Path, ending: str, slam_map: SlamMap, cloud: PointCloud, maps: Sequence[SurfaceMap]) -> None:
+    """Write a picture to `path` in the format of `ending` (.png, .svg, .pdf): a plan, and each map from above."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7 * (1 + len(maps)), 7), layout="constrained")
+    FigureCanvasAgg(figure)
+    _draw_plan(figure.add_subplot(1, 1 + len(maps), 1), slam_map, cloud)
+    for k, one in enumerate(maps):
+        _draw_surfaces(figure.add_subplot(1, 1 + len(maps), 2 + k, projection="3d"), one)
+    # Without a date the same run gives the same bytes.
+    figure.savefig(path, format=ending.lstrip(".") or "png", dpi=110, metadata=_no_date(ending))
+
+
+def _no_date(ending: str) -> dict[str, Any]:
+    return {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(ending, {})
+
+
+def _draw_plan(axes: Any, slam_map: SlamMap, cloud: PointCloud) -> None:
+    step = max(1, len(cloud.points) // MOST_POINTS)
+    axes.scatter(*cloud.points[::step, :2].T, s=0.2, c="0.75", linewidths=0, rasterized=True, label="cloud")
+    ends = segment_ends(slam_map.lines)
+    for k, (a, b) in enumerate(ends):
+        axes.plot([a[0], b[0]], [a[1], b[1]], "b-", lw=1, label="lines" if k == 0 else None)
+    axes.plot(*slam_map.trajectory.poses[:, :2].T, "r-", lw=1.2, label="trajectory")
+    axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title="plan")
+    axes.legend(loc="upper right", fontsize=8)
+
+
+def segment_ends(lines: LineMap) -> Array:
+    """(m, 2, 2) both end points of each segment, in map."""
+    alpha, r = lines.parameters.T
+    n, t = np.stack([np.cos(alpha), np.sin(alpha)], -1), np.stack([-np.sin(alpha), np.cos(alpha)], -1)
+    return (n * r[:, None])[:, None] + t[:, None] * lines.extents[..., None]
+
+
+def _draw_surfaces(axes: Any, one: SurfaceMap) -> None:
+    from matplotlib import colormaps
+
+    colors = colormaps["tab20"].colors  # type: ignore[attr-defined]
+    u, v = np.linspace(0, 1, 60), np.linspace(0, 1, 15)
+    for k, surface in enumerate(one.surfaces):
+        x, y, z = np.moveaxis(evaluate_grid(surface, u, v), 2, 0)
+        axes.plot_wireframe(x, y, z, color=colors[k % len(colors)], linewidth=0.4, rcount=60, ccount=15)
+    count = sum(s.control_points.shape[0] * s.control_points.shape[1] for s in one.surfaces)
+    axes.set(title=f"{len(one.surfaces)} surfaces, {count} control points", aspect="equal")
+    axes.view_init(elev=55, azim=-60)

@@ -1,0 +1,163 @@
+"""Data association, method.md section 3: individual and joint compatibility, partial compatibility algorithm (PCA)."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from bsmap_cli.core import se2
+from bsmap_cli.core.gaussian import chi2_gate
+from bsmap_cli.model import Array, IntArray
+from bsmap_cli.slam.filter import FilterState, expected_lines, gather, line_jacobians
+from bsmap_cli.slam.segments import Segments
+
+MAX_ANGLE = 0.5
+"""Radians; pairs farther apart are not looked at."""
+
+
+class Candidates(NamedTuple):
+    """Pairs that are individually compatible, by segment, nearest first.
+
+    segment, line : (k,).  innovation : (2 k,), stacked.  covariance : (2 k, 2 k), of the stacked innovations; blocks of
+    two pairs of one segment mean nothing, for no hypothesis holds both.  distance : (k,) squared Mahalanobis.
+    """
+
+    segment: IntArray
+    line: IntArray
+    innovation: Array
+    covariance: Array
+    distance: Array
+
+    def joint_distance(self, pairs: Sequence[int]) -> float:
+        """Squared Mahalanobis distance of the hypothesis that holds these pairs."""
+        index = np.array([i for p in pairs for i in (2 * p, 2 * p + 1)])
+        v = self.innovation[index]
+        return float(v @ np.linalg.solve(self.covariance[np.ix_(index, index)], v))
+
+    def of_segment(self) -> dict[int, list[int]]:
+        """Pairs of each segment that has any, nearest first."""
+        out: dict[int, list[int]] = {}
+        for pair, segment in enumerate(self.segment):
+            out.setdefault(int(segment), []).append(pair)
+        return out
+
+
+def find_candidates(state: FilterState, extents: Array, segments: Segments, gate: float, margin: float) -> Candidates:
+    """Pairs of segments and map lines that pass the individual compatibility test and lie beside each other.
+
+    extents : (m, 2) of the map's lines along their t, metres.  margin : metres by which extents may miss each other.
+    That n points away from the robot in both makes sure that the same side is seen.
+    """
+    near = _near_pairs(state, extents, segments, margin)
+    empty = Candidates(*near, np.zeros(0), np.zeros((0, 0)), np.zeros(0))
+    if len(near[0]) == 0:
+        return empty
+    segment, line = near
+    innovation, covariance = _innovations(state, segments, segment, line)
+    blocks = covariance.reshape(len(line), 2, len(line), 2)[np.arange(len(line)), :, np.arange(len(line))]
+    distance = np.einsum("ki,ki->k", innovation, np.linalg.solve(blocks, innovation[..., None])[..., 0])
+    order = np.lexsort((distance, segment))
+    order = order[distance[order] <= chi2_gate(gate, 2)]
+    index = np.stack([2 * order, 2 * order + 1], axis=1).ravel()
+    return Candidates(
+        segment[order], line[order], innovation[order].ravel(), covariance[np.ix_(index, index)], distance[order]
+    )
+
+
+def _near_pairs(state: FilterState, extents: Array, segments: Segments, margin: float) -> tuple[IntArray, IntArray]:
+    """Pairs worth a test: similar direction, extents that overlap or nearly so, and not far apart in between."""
+    x, y, theta = state.pose
+    expected = expected_lines(state.pose, state.lines)
+    alpha = expected[:, 0] + theta
+    shift = -x * np.sin(alpha) + y * np.cos(alpha)
+    low, high = extents[:, 0] - shift, extents[:, 1] - shift
+    turn = se2.wrap(segments.parameters[:, None, 0] - expected[None, :, 0])
+    begin = np.maximum(segments.extents[:, None, 0], low[None])
+    end = np.minimum(segments.extents[:, None, 1], high[None])
+    # Two lines that differ in direction are compared where they are seen, not at the foot of the normal.
+    middle = (segments.extents[:, 0] + segments.extents[:, 1]) / 2
+    apart = segments.parameters[:, None, 1] - expected[None, :, 1] - turn * middle[:, None]
+    sigma = np.sqrt(np.maximum(np.diag(gather(state.covariance, np.arange(3))), 0.0))
+    reach = 0.5 + 4.0 * (sigma[0] + sigma[1])
+    near = (np.abs(turn) < MAX_ANGLE) & (end - begin > -margin) & (np.abs(apart) < reach)
+    segment, line = np.nonzero(near)
+    return segment, line
+
+
+def _innovations(state: FilterState, segments: Segments, segment: IntArray, line: IntArray) -> tuple[Array, Array]:
+    """Innovations (k, 2) of pairs and the covariance (2 k, 2 k) of all of them stacked, correlations included."""
+    k = len(line)
+    lines, column = np.unique(line, return_inverse=True)
+    index = np.r_[np.arange(3), (3 + 2 * lines[:, None] + np.arange(2)).ravel()]
+    P = gather(state.covariance, index)
+    H = np.zeros((k, 2, len(index)))
+    for pair in range(k):
+        by_pose, by_line = line_jacobians(state.pose, state.lines[line[pair], 0])
+        at = 3 + 2 * column[pair]
+        H[pair, :, :3], H[pair, :, at : at + 2] = by_pose, by_line
+    innovation = segments.parameters[segment] - expected_lines(state.pose, state.lines[line])
+    innovation[:, 0] = se2.wrap(innovation[:, 0])
+    flat = H.reshape(2 * k, -1)
+    covariance = flat @ P @ flat.T
+    on_diagonal = covariance.reshape(k, 2, k, 2)
+    on_diagonal[np.arange(k), :, np.arange(k)] += segments.covariances[segment]
+    return innovation, covariance
+
+
+def best_joint_match(candidates: Candidates, segments: Sequence[int], gate: float) -> list[int]:
+    """Branch and bound for the largest jointly compatible hypothesis of these segments, the nearest of equal ones.
+
+    This is joint compatibility branch and bound (Neira and Tardos 2001): exponential, hence for small groups.
+    """
+    of_segment = candidates.of_segment()
+    chosen: list[int] = []
+    best: tuple[int, float, list[int]] = (0, 0.0, [])
+
+    def descend(depth: int, distance: float) -> None:
+        nonlocal best
+        if len(chosen) + len(segments) - depth < best[0]:
+            return
+        if depth == len(segments):
+            if len(chosen) > best[0] or (len(chosen) == best[0] and distance < best[1]):
+                best = (len(chosen), distance, list(chosen))
+            return
+        for pair in of_segment.get(segments[depth], ()):
+            # Two segments may share a line: parts of one wall with a door between them.
+            chosen.append(pair)
+            joint = candidates.joint_distance(chosen)
+            if joint <= chi2_gate(gate, 2 * len(chosen)):
+                descend(depth + 1, joint)
+            chosen.pop()
+        descend(depth + 1, distance)
+
+    descend(0, 0.0)
+    return best[2]
+
+
+def partial_compatibility(candidates: Candidates, order: Sequence[int], group_size: int, gate: float) -> list[int]:
+    """Matching vector by the partial compatibility algorithm: pairs (indices into `candidates`), jointly compatible.
+
+    order : segments in order of bearing; neighbours form groups of `group_size`. Each group's best joint match joins
+    the whole if that stays jointly compatible; else its single pairs and the nearest candidates do, one by one.
+    """
+    of_segment = candidates.of_segment()
+    seen = [s for s in order if s in of_segment]
+    whole: list[int] = []
+    for start in range(0, len(seen), group_size):
+        group = seen[start : start + group_size]
+        local = best_joint_match(candidates, group, gate)
+        if local and _compatible(candidates, whole + local, gate):
+            whole += local
+            continue
+        nearest = [of_segment[s][0] for s in group]
+        taken: set[int] = set()
+        for pair in sorted({*local, *nearest}, key=lambda p: (candidates.distance[p], p)):
+            segment = int(candidates.segment[pair])
+            if segment not in taken and _compatible(candidates, [*whole, pair], gate):
+                whole.append(pair)
+                taken.add(segment)
+    return whole
+
+
+def _compatible(candidates: Candidates, pairs: Sequence[int], gate: float) -> bool:
+    return candidates.joint_distance(pairs) <= chi2_gate(gate, 2 * len(pairs))

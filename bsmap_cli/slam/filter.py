@@ -1,0 +1,178 @@
+"""Line EKF, method.md section 2 (Eq. 6-15): predict, update by one pair or one constraint, augment, remove.
+
+The covariance is kept in the lower triangle of a Fortran-ordered square with room to grow: a pair changes it by a
+downdate of rank 2 (BLAS dsyrk) in place, which is fast and cannot lose symmetry. Hence the functions reuse the
+buffers: a state given to one of them must not be used afterwards, only the one returned.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg.blas import dsyrk
+
+from bsmap_cli.core import se2
+from bsmap_cli.errors import BsmapError
+from bsmap_cli.model import Array, IntArray
+
+GROWTH = 64
+
+
+class FilterState(NamedTuple):
+    """mean : (capacity,) x, y, theta of base_link in map, then alpha, r of each line; covariance : (capacity,
+    capacity), lower triangle; size : entries in use. Lines' n points away from where the robot saw them (r may be < 0).
+    """
+
+    mean: Array
+    covariance: Array
+    size: int
+
+    @property
+    def pose(self) -> Array:
+        """(3,) x, y, theta."""
+        return self.mean[:3]
+
+    @property
+    def lines(self) -> Array:
+        """(m, 2) alpha, r."""
+        return self.mean[3 : self.size].reshape(-1, 2)
+
+
+def initial_state(pose: Array | None = None, pose_covariance: Array | None = None) -> FilterState:
+    """State without lines; the map's frame is by default where the robot starts."""
+    mean, covariance = np.zeros(GROWTH), np.zeros((GROWTH, GROWTH), order="F")
+    if pose is not None:
+        mean[:3] = pose
+    if pose_covariance is not None:
+        covariance[:3, :3] = pose_covariance
+    return FilterState(mean, covariance, 3)
+
+
+def pose_covariance(state: FilterState) -> Array:
+    """(3, 3) of x, y, theta in map."""
+    return gather(state.covariance, np.arange(3))
+
+
+def gather(covariance: Array, index: IntArray) -> Array:
+    """Rows and columns `index` (k,) of the symmetric matrix whose lower triangle is given, full (k, k)."""
+    row, column = np.maximum.outer(index, index), np.minimum.outer(index, index)
+    return covariance[row, column]
+
+
+def _columns(state: FilterState, first: int, count: int) -> Array:
+    """(size, count) columns of the full symmetric covariance."""
+    P, n, last = state.covariance, state.size, first + count
+    out = np.empty((n, count))
+    out[last:] = P[last:n, first:last]
+    out[:first] = P[first:last, :first].T
+    out[first:last] = gather(P, np.arange(first, last))
+    return out
+
+
+def predict(state: FilterState, increment: Array, noise: Array) -> FilterState:
+    """Pose compounded with a motion, Eq. (6)-(8).
+
+    increment : (3,) motion in the robot's frame.  noise : (3, 3), its covariance there.
+    """
+    by_pose, by_motion = se2.compose_jacobians(state.pose, increment)
+    P, n = state.covariance, state.size
+    P[:3, :3] = by_pose @ gather(P, np.arange(3)) @ by_pose.T + by_motion @ noise @ by_motion.T
+    P[3:n, :3] = P[3:n, :3] @ by_pose.T
+    state.mean[:3] = se2.compose(state.pose, increment)
+    return state
+
+
+def expected_lines(pose: Array, lines: Array) -> Array:
+    """(m, 2) alpha, r of map lines (m, 2) as seen from the pose, Eq. (9)."""
+    alpha, r = lines[:, 0], lines[:, 1]
+    seen_r = r - pose[0] * np.cos(alpha) - pose[1] * np.sin(alpha)
+    return np.stack([se2.wrap(alpha - pose[2]), seen_r], axis=1)
+
+
+def line_jacobians(pose: Array, alpha: float) -> tuple[Array, Array]:
+    """Derivatives of `expected_lines` by the pose (2, 3) and by the line (2, 2), Eq. (10)."""
+    c, s = np.cos(alpha), np.sin(alpha)
+    by_pose = np.array([[0.0, 0.0, -1.0], [-c, -s, 0.0]])
+    by_line = np.array([[1.0, 0.0], [pose[0] * s - pose[1] * c, 1.0]])
+    return by_pose, by_line
+
+
+def update(state: FilterState, line: int, observed: Array, noise: Array) -> tuple[FilterState, float]:
+    """Correct by one matched pair, linearised at the state as it is now, Eq. (11)-(15).
+
+    observed : (2,) alpha, r in base_link.  noise : (2, 2).  Returns the state and the normalised innovation squared.
+    """
+    first = 3 + 2 * line
+    by_pose, by_line = line_jacobians(state.pose, state.mean[first])
+    innovation = observed - expected_lines(state.pose, state.mean[None, first : first + 2])[0]
+    innovation[0] = se2.wrap(innovation[0])
+    cross = _columns(state, 0, 3) @ by_pose.T + _columns(state, first, 2) @ by_line.T
+    S = by_pose @ cross[:3] + by_line @ cross[first : first + 2] + noise
+    return _correct(state, cross, S, innovation)
+
+
+def constrain_equal(state: FilterState, first: int, second: int, noise: Array) -> FilterState:
+    """Correct by the knowledge that two lines are one, up to `noise` (2, 2) of their difference."""
+    i, j = 3 + 2 * first, 3 + 2 * second
+    cross = _columns(state, i, 2) - _columns(state, j, 2)
+    S = cross[i : i + 2] - cross[j : j + 2] + noise
+    difference = state.mean[j : j + 2] - state.mean[i : i + 2]
+    difference[0] = se2.wrap(difference[0])
+    return _correct(state, cross, S, difference)[0]
+
+
+def _correct(state: FilterState, cross: Array, S: Array, innovation: Array) -> tuple[FilterState, float]:
+    """State corrected by an innovation (2,) with covariance S (2, 2); cross : (size, 2) = P H'."""
+    S = (S + S.T) / 2
+    try:
+        L = np.linalg.cholesky(S)
+    except np.linalg.LinAlgError as error:
+        raise BsmapError("the filter's innovation covariance is no longer positive definite") from error
+    inverse = np.array([[1 / L[0, 0], 0.0], [-L[1, 0] / (L[0, 0] * L[1, 1]), 1 / L[1, 1]]])
+    whitened = inverse @ innovation
+    W = np.zeros((len(state.mean), 2), order="F")
+    W[: state.size] = cross @ inverse.T
+    state.mean[: state.size] += W[: state.size] @ whitened
+    state.mean[2] = se2.wrap(state.mean[2])
+    P = dsyrk(-1.0, W, beta=1.0, c=state.covariance, lower=1, overwrite_c=1)
+    return FilterState(state.mean, P, state.size), float(whitened @ whitened)
+
+
+def augment(state: FilterState, observed: Array, noise: Array) -> FilterState:
+    """Append a line seen at (2,) alpha, r in base_link with covariance `noise` (2, 2), Eq. (4)-(5)."""
+    state = _with_room(state, state.size + 2)
+    x, y, theta = state.pose
+    alpha = observed[0] + theta
+    c, s = np.cos(alpha), np.sin(alpha)
+    lever = y * c - x * s
+    by_pose = np.array([[0.0, 0.0, 1.0], [c, s, lever]])
+    by_observed = np.array([[1.0, 0.0], [lever, 1.0]])
+    P, n = state.covariance, state.size
+    cross = _columns(state, 0, 3) @ by_pose.T
+    P[n : n + 2, :n] = cross.T
+    P[n : n + 2, n : n + 2] = by_pose @ cross[:3] + by_observed @ noise @ by_observed.T
+    state.mean[n : n + 2] = alpha, observed[1] + x * c + y * s
+    return FilterState(state.mean, P, n + 2)
+
+
+def remove(state: FilterState, line: int) -> FilterState:
+    """Marginalise a line out; the last line takes its place."""
+    P, n, at = state.covariance, state.size, 3 + 2 * line
+    if at != n - 2:
+        last = _columns(state, n - 2, 2)
+        P[at : at + 2, :at] = last[:at].T
+        P[at + 2 : n - 2, at : at + 2] = last[at + 2 : n - 2]
+        P[at : at + 2, at : at + 2] = last[n - 2 :]
+        state.mean[at : at + 2] = state.mean[n - 2 : n]
+    P[n - 2 : n, :n] = 0.0
+    state.mean[n - 2 : n] = 0.0
+    return FilterState(state.mean, P, n - 2)
+
+
+def _with_room(state: FilterState, size: int) -> FilterState:
+    capacity = len(state.mean)
+    if size <= capacity:
+        return state
+    grown = capacity + max(GROWTH, capacity // 4)
+    mean, covariance = np.zeros(grown), np.zeros((grown, grown), order="F")
+    mean[:capacity], covariance[:capacity, :capacity] = state.mean, state.covariance
+    return FilterState(mean, covariance, state.size)

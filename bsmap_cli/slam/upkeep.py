@@ -1,0 +1,150 @@
+"""Map upkeep, method.md section 4: what is kept beside each line; extending, joining and forgetting lines."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from bsmap_cli.core import se2
+from bsmap_cli.core.gaussian import chi2_gate
+from bsmap_cli.core.table import take
+from bsmap_cli.model import Array, IntArray, LineMap
+from bsmap_cli.slam.filter import FilterState, constrain_equal, gather, remove
+from bsmap_cli.slam.segments import Segments
+
+JOIN_ANGLE = 0.1
+JOIN_OFFSET = 0.1
+"""Radians and metres; lines farther apart are never tried."""
+
+
+class Landmarks(NamedTuple):
+    """What the map keeps of each line beside its parameters.
+
+    extents : (m, 2), metres.  hits : (m,) scans that saw it.  last_seen : (m,) the last of these, counted in key scans.
+    """
+
+    extents: Array
+    hits: IntArray
+    last_seen: IntArray
+
+
+def no_landmarks() -> Landmarks:
+    """An empty map."""
+    return Landmarks(np.zeros((0, 2)), np.zeros(0, int), np.zeros(0, int))
+
+
+def extents_in_map(pose: Array, parameters: Array, extents: Array) -> Array:
+    """(k, 2) extents of segments seen from the pose, along t of the map's frame."""
+    alpha = parameters[:, 0] + pose[2]
+    shift = -pose[0] * np.sin(alpha) + pose[1] * np.cos(alpha)
+    return extents + shift[:, None]
+
+
+def extend(
+    state: FilterState, landmarks: Landmarks, segments: Segments, pairs: list[tuple[int, int]], step: int
+) -> Landmarks:
+    """Landmarks after the matched pairs (segment, line) of a step: extents cover what was seen, hits count it."""
+    if not pairs:
+        return landmarks
+    segment, line = np.array(pairs).T
+    extents, hits, last_seen = landmarks.extents.copy(), landmarks.hits.copy(), landmarks.last_seen.copy()
+    alpha = segments.parameters[segment, 0]
+    n, t = np.stack([np.cos(alpha), np.sin(alpha)], -1), np.stack([-np.sin(alpha), np.cos(alpha)], -1)
+    map_alpha = state.lines[line, 0]
+    map_t = np.stack([-np.sin(map_alpha), np.cos(map_alpha)], -1)
+    for end in (0, 1):  # the segment's end points, carried into the map and measured along the stored line
+        point = n * segments.parameters[segment, 1:] + t * segments.extents[segment, end : end + 1]
+        along = np.einsum("ij,ij->i", se2.transform(state.pose, point), map_t)
+        np.minimum.at(extents[:, 0], line, along)
+        np.maximum.at(extents[:, 1], line, along)
+    hits[np.unique(line)] += 1
+    last_seen[line] = step
+    return Landmarks(extents, hits, last_seen)
+
+
+def append(landmarks: Landmarks, extents: Array, step: int) -> Landmarks:
+    """Landmarks with new lines of extents (k, 2), seen for the first time."""
+    ones = np.ones(len(extents), int)
+    return Landmarks(
+        np.r_[landmarks.extents, extents], np.r_[landmarks.hits, ones], np.r_[landmarks.last_seen, step * ones]
+    )
+
+
+def prune(
+    state: FilterState, landmarks: Landmarks, step: int, fewest_hits: int, patience: int
+) -> tuple[FilterState, Landmarks]:
+    """Forget lines seen in fewer than `fewest_hits` scans and not in the last `patience` key scans: clutter, people."""
+    stale = (landmarks.hits < fewest_hits) & (step - landmarks.last_seen > patience)
+    for line in np.flatnonzero(stale)[::-1]:
+        state, landmarks = discard(state, landmarks, int(line))
+    return state, landmarks
+
+
+def join_lines(
+    state: FilterState, landmarks: Landmarks, touched: list[int], gate: float, margin: float, noise: Array
+) -> tuple[FilterState, Landmarks]:
+    """Join stored lines that are one: same parameters within their joint covariance, extents that touch.
+
+    touched : lines that this step changed; the others need no new look.  noise : (2, 2), by which parts of one wall
+    may differ, for no wall is perfectly straight.
+    """
+    while (pair := _first_joinable(state, landmarks, touched, gate, margin, noise)) is not None:
+        keep, drop = pair
+        state = constrain_equal(state, keep, drop, noise)
+        extents, hits, last_seen = landmarks.extents.copy(), landmarks.hits.copy(), landmarks.last_seen.copy()
+        extents[keep] = min(extents[keep, 0], extents[drop, 0]), max(extents[keep, 1], extents[drop, 1])
+        hits[keep] += hits[drop]
+        last_seen[keep] = max(last_seen[keep], last_seen[drop])
+        state, landmarks = discard(state, Landmarks(extents, hits, last_seen), drop)
+        last = len(hits) - 1
+        touched = sorted({drop if line == last else line for line in touched if line != drop} | {keep})
+    return state, landmarks
+
+
+def discard(state: FilterState, landmarks: Landmarks, line: int) -> tuple[FilterState, Landmarks]:
+    """Forget a line; as in the filter, the last one takes its place."""
+    rows = np.arange(len(landmarks.hits) - 1)
+    rows[line:][:1] = len(rows)
+    return remove(state, line), take(landmarks, rows)
+
+
+def _first_joinable(
+    state: FilterState, landmarks: Landmarks, touched: list[int], gate: float, margin: float, noise: Array
+) -> tuple[int, int] | None:
+    """Lines to join, the smaller index first; None when no pair passes."""
+    for line in touched:
+        for other in _near_lines(state.lines, landmarks.extents, line, margin):
+            first, second = sorted((line, int(other)))
+            index = np.array([3 + 2 * first, 4 + 2 * first, 3 + 2 * second, 4 + 2 * second])
+            C = gather(state.covariance, index)
+            difference = state.lines[first] - state.lines[second]
+            difference[0] = se2.wrap(difference[0])
+            S = C[:2, :2] + C[2:, 2:] - C[:2, 2:] - C[2:, :2] + noise
+            if difference @ np.linalg.solve(S, difference) < chi2_gate(gate, 2):
+                return first, second
+    return None
+
+
+def _near_lines(lines: Array, extents: Array, line: int, margin: float) -> IntArray:
+    turn = se2.wrap(lines[:, 0] - lines[line, 0])
+    begin, end = np.maximum(extents[:, 0], extents[line, 0]), np.minimum(extents[:, 1], extents[line, 1])
+    # Offset in the middle of the overlap (or of the gap); turning by a small angle moves a point at t by t times it.
+    apart = lines[:, 1] - lines[line, 1] - turn * (begin + end) / 2
+    near = (np.abs(turn) < JOIN_ANGLE) & (np.abs(apart) < JOIN_OFFSET) & (end - begin > -margin)
+    near[line] = False
+    return np.flatnonzero(near)
+
+
+def to_line_map(state: FilterState, landmarks: Landmarks) -> LineMap:
+    """The stored lines with r >= 0; the side tells from where they were seen."""
+    parameters = state.lines.copy()
+    m = len(parameters)
+    index = 3 + 2 * np.arange(m)[:, None] + np.arange(2)
+    rows, columns = np.maximum(index[:, :, None], index[:, None]), np.minimum(index[:, :, None], index[:, None])
+    covariances, extents = state.covariance[rows, columns], landmarks.extents.copy()
+    flip = parameters[:, 1] < 0
+    parameters[flip] = parameters[flip] * [1, -1] + [np.pi, 0]
+    extents[flip] = -extents[flip][:, ::-1]
+    covariances[flip, 0, 1] *= -1
+    covariances[flip, 1, 0] *= -1
+    parameters[:, 0] = se2.wrap(parameters[:, 0])
+    return LineMap(parameters, covariances, extents, np.where(flip, 1, -1), landmarks.hits)

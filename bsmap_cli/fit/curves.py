@@ -1,0 +1,153 @@
+"""Least-squares B-spline curves through many rows of points on one knot vector, method.md section 7.
+
+The knot vector starts without inner knots and gets new ones where the error is worst, until the bound holds.
+"""
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bsmap_cli.core import leastsquares
+from bsmap_cli.core.bspline import basis_functions, clamped_knots, inner_knots, open_knots
+from bsmap_cli.model import Array, IntArray
+
+
+class Rows(NamedTuple):
+    """Data of the curves, row after row, ascending in u within each row.
+
+    u : (n,) parameters from 0 to 1.  row : (n,) number of the curve, 0 ... rows - 1, ascending.
+    data : (n, k, 3), k points at each parameter, each of a curve of its own (k = 1 for plain curves), metres.
+    """
+
+    u: Array
+    row: IntArray
+    data: Array
+
+    @property
+    def n_rows(self) -> int:
+        """Number of rows."""
+        return int(self.row[-1]) + 1 if len(self.row) else 0
+
+
+class CurveFit(NamedTuple):
+    """Curves on a common knot vector.
+
+    knots : (n_control + degree + 1,).  control_points : (rows, n_control, k, 3).
+    factor : (degree + 1, rows * n_control), Cholesky factor of all rows' N'N, block after block.
+    errors : (n,) metres, distance of each data point to its curve at its parameter (the largest of the k).
+    """
+
+    knots: Array
+    control_points: Array
+    factor: Array
+    errors: Array
+
+
+def centripetal(points: Array, row: IntArray) -> Array:
+    """Centripetal parameters (n,), from 0 to 1 in each row, of points (n, 3): steps as sqrt of the chord lengths.
+
+    A row whose points all coincide gets equal steps.
+    """
+    chords = np.sqrt(np.linalg.norm(np.diff(points, axis=0), axis=1))
+    same_row = row[1:] == row[:-1]
+    first = np.flatnonzero(np.concatenate([[True], ~same_row]))
+    counts = np.diff(np.append(first, len(row)))
+    steps = np.concatenate([[0.0], np.where(same_row, chords, 0.0)])
+    degenerate = np.repeat(np.add.reduceat(steps, first) <= 0.0, counts)
+    steps = np.where(degenerate, 1.0, steps)
+    steps[first] = 0.0
+    along = np.cumsum(steps)
+    along -= np.repeat(along[first], counts)
+    last = first + counts - 1
+    total = np.where(along[last] > 0.0, along[last], 1.0)
+    u = along / np.repeat(total, counts)
+    u[last[counts > 1]] = 1.0
+    return np.clip(u, 0.0, 1.0)
+
+
+def fit_curves(rows: Rows, knots: Array, degree: int) -> CurveFit:
+    """Least-squares curves of all rows on given knots, (N'N) P = N'Q, with one banded factorisation.
+
+    Raises BsmapError where a span lacks data.
+    """
+    n_control = len(knots) - degree - 1
+    first, values = basis_functions(knots, degree, rows.u)
+    values = values[:, 0]
+    flat = rows.data.reshape(len(rows.u), -1)
+    columns = rows.n_rows * n_control
+    solution, factor = leastsquares.fit(first + rows.row * n_control, values, flat, columns)
+    fitted = np.zeros_like(flat)
+    for r in range(degree + 1):
+        fitted += values[:, r, None] * solution[first + r + rows.row * n_control]
+    errors = np.linalg.norm((fitted - flat).reshape(rows.data.shape), axis=2).max(axis=1)
+    control_points = solution.reshape(rows.n_rows, n_control, *rows.data.shape[1:])
+    return CurveFit(knots, control_points, factor, errors)
+
+
+def refine_curves(rows: Rows, degree: int, bound: float, knots_per_pass: int) -> CurveFit:
+    """Curves with as many common knots as the bound needs, or as the data bear.
+
+    Each pass inserts up to `knots_per_pass` knots at the parameters of the worst points over all rows, and fits again
+    (the paper inserts one). It ends when no error exceeds `bound`, or when no knot can be added without leaving a span
+    of some row without data: then the bound lies below the noise, or below what jumps between the points allow.
+
+    Raises BsmapError where a row has less than degree + 1 points.
+    """
+    knots = open_knots(degree)
+    while True:
+        fit = fit_curves(rows, knots, degree)
+        if fit.errors.max() <= bound:
+            return fit
+        refined = _add_knots(rows, fit, degree, bound, knots_per_pass)
+        if len(refined) == len(knots):
+            return fit
+        knots = refined
+
+
+def _add_knots(rows: Rows, fit: CurveFit, degree: int, bound: float, count: int) -> Array:
+    """Knots with up to `count` more, at most one a span, where the error is worst and the data allow it."""
+    breaks = np.unique(fit.knots)
+    span = np.clip(np.searchsorted(breaks, rows.u, side="right") - 1, 0, len(breaks) - 2)
+    lowest, highest = _common_interval(rows, span, len(breaks) - 1)
+    allowed = (rows.u > lowest[span]) & (rows.u <= highest[span]) & (rows.u < 1.0)
+    candidates = np.flatnonzero(allowed & (fit.errors > bound))
+    knots = fit.knots
+    taken: set[int] = set()
+    for index in candidates[np.argsort(-fit.errors[candidates], kind="stable")]:
+        if len(taken) == count:
+            break
+        if span[index] in taken:
+            continue
+        tried = clamped_knots(degree, np.append(inner_knots(knots, degree), rows.u[index]))
+        if schoenberg_whitney(tried, degree, rows):
+            knots = tried
+            taken.add(int(span[index]))
+    return knots
+
+
+def _common_interval(rows: Rows, span: NDArray[np.intp], spans: int) -> tuple[Array, Array]:
+    """For each span (spans,) where a knot must lie, lowest < knot <= highest, to leave every row data on both sides."""
+    # Rows ascend in u, and every row has data in every span: the first of each (row, span) are in order.
+    first = np.flatnonzero(np.diff(rows.row * spans + span, prepend=-1))
+    last = np.append(first[1:], len(span)) - 1
+    return rows.u[first].reshape(-1, spans).max(axis=0), rows.u[last].reshape(-1, spans).min(axis=0)
+
+
+def schoenberg_whitney(knots: Array, degree: int, rows: Rows) -> bool:
+    """Whether in each row some points u_i can be chosen, one for each control point, with t_i < u_i < t_{i+p+1}.
+
+    The condition under which N'N is regular (Schoenberg and Whitney 1953). Choosing the lowest point left is enough.
+    """
+    n_control = len(knots) - degree - 1
+    order = np.arange(n_control)
+    lower, upper = knots[:n_control], knots[degree + 1 :]
+    starts = np.searchsorted(rows.row, np.arange(rows.n_rows + 1))
+    for start, stop in itertools.pairwise(starts):
+        u = rows.u[start:stop]
+        above = np.where(lower > 0.0, np.searchsorted(u, lower, side="right"), 0)
+        chosen = order + np.maximum.accumulate(above - order)
+        if chosen[-1] >= len(u) or not np.all((u[chosen] < upper) | (upper >= 1.0)):
+            return False
+    return True

@@ -1,0 +1,76 @@
+"""Scan lines of a data set: the points of its scans in the order of the beams, with the sensor's covariance."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from bsmap_cli.core import se2
+from bsmap_cli.core.gaussian import pack
+from bsmap_cli.fit.movement import Movement
+from bsmap_cli.model import Array, IntArray, PointCloud, PosePart
+
+
+class ScanLines(NamedTuple):
+    """Points of a data set, scan after scan in order of movement, beam after beam.
+
+    points : (n, 3) in map.  line : (n,) number of the scan line, 0 ... lines - 1, ascending.
+    covariances : (n, 6) in map, sensor part, packed.
+    """
+
+    points: Array
+    line: IntArray
+    covariances: Array
+
+    @property
+    def n_lines(self) -> int:
+        """Number of scan lines."""
+        return int(self.line[-1]) + 1 if len(self.line) else 0
+
+
+def gather_lines(cloud: PointCloud, movement: Movement, fewest: int) -> ScanLines:
+    """Scan lines of a data set; scans with less than `fewest` points are left out."""
+    bounds = np.searchsorted(cloud.scan_index, np.stack([movement.scans, movement.scans + 1]))
+    bounds = bounds[:, bounds[1] - bounds[0] >= fewest]
+    ranges = [np.arange(a, b) for a, b in bounds.T]
+    index = np.concatenate([*ranges, np.zeros(0, dtype=np.int64)]).astype(np.int64)
+    line = np.repeat(np.arange(len(ranges)), bounds[1] - bounds[0])
+    return ScanLines(cloud.points[index], line, _sensor_covariances(cloud, index))
+
+
+def _sensor_covariances(cloud: PointCloud, index: IntArray) -> Array:
+    """Sensor part J_rho diag(sigma_rho^2, sigma_phi^2) J_rho' of Eq. (18), (n, 6) in map, of points `index` (n,).
+
+    Computed anew from the beams: taking the pose part from the whole would leave rounding errors of its size.
+    """
+    pose = cloud.scan_poses[cloud.scan_index[index]]
+    phi = cloud.angle_min + cloud.angle_increment * cloud.beam_index[index]
+    zero = np.zeros_like(phi)
+    along = np.stack([np.cos(phi), np.sin(phi), zero], axis=1) @ cloud.mount[:3, :3].T
+    across = np.stack([-np.sin(phi), np.cos(phi), zero], axis=1) @ cloud.mount[:3, :3].T
+    origin = np.column_stack([se2.transform(pose, cloud.mount[:2, 3]), np.full(len(index), cloud.mount[2, 3])])
+    distance = np.linalg.norm(cloud.points[index] - origin, axis=1)
+    along, across = _turn(pose[:, 2], along), _turn(pose[:, 2], across)
+    across *= (cloud.angle_sigma * distance)[:, None]
+    along *= cloud.range_sigma
+    return pack(along[:, :, None] * along[:, None, :] + across[:, :, None] * across[:, None, :])
+
+
+def _turn(theta: Array, vectors: Array) -> Array:
+    """Vectors (n, 3) turned by theta (n,) about z."""
+    c, s = np.cos(theta), np.sin(theta)
+    x, y, z = vectors.T
+    return np.column_stack([c * x - s * y, s * x + c * y, z])
+
+
+def pose_part(cloud: PointCloud, movement: Movement, name: str) -> PosePart:
+    """Error of pose common to a data set: mean of the scans' covariances, each turned about the mean position.
+
+    An approximation: the poses of a set are taken to err together. What they err apart is left to the residuals.
+    """
+    poses, covariances = cloud.scan_poses[movement.scans], cloud.scan_pose_covariances[movement.scans]
+    centre = poses[:, :2].mean(axis=0)
+    J = np.tile(np.eye(3), (len(poses), 1, 1))
+    J[:, 0, 2] = poses[:, 1] - centre[1]
+    J[:, 1, 2] = centre[0] - poses[:, 0]
+    about_centre = (J @ covariances @ np.swapaxes(J, 1, 2)).mean(axis=0)
+    return PosePart(name, centre, (about_centre + about_centre.T) / 2)

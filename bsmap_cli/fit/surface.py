@@ -1,0 +1,127 @@
+"""Surface of a data set: curves along its scan lines, then across them through their control points, Eq. (19-33)."""
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+
+from bsmap_cli.core import leastsquares
+from bsmap_cli.core.bspline import TensorSpline, design_matrix, evaluate_surface
+from bsmap_cli.errors import BsmapError
+from bsmap_cli.fit.curves import CurveFit, Rows, centripetal, refine_curves
+from bsmap_cli.fit.lines import ScanLines
+from bsmap_cli.model import Array, Residuals
+from bsmap_cli.params import FitParams
+
+
+class SurfaceFit(NamedTuple):
+    """A fitted surface with what its covariance needs.
+
+    blocks : (nu, nv, 6) sensor covariance of each control point.  correlation_u : (nu, nu), correlation_v : (nv, nv).
+    u : (n,) parameters of the data points.  v : (lines,) parameters of the scan lines.
+    error_u, error_v : metres, largest errors of the curves along and across the scan lines.
+    """
+
+    spline: TensorSpline
+    blocks: Array
+    correlation_u: Array
+    correlation_v: Array
+    u: Array
+    v: Array
+    residuals: Residuals
+    error_u: float
+    error_v: float
+
+
+def fit_scan_lines(lines: ScanLines, params: FitParams) -> SurfaceFit:
+    """Fit one surface to scan lines, the paper's way.
+
+    The degree across is lowered where there are not scan lines enough for it.
+
+    Raises
+    ------
+    BsmapError
+        With less than two scan lines, or a line of less than degree_u + 1 points.
+    """
+    if lines.n_lines < 2:
+        raise BsmapError(f"a surface needs 2 scan lines, here is {lines.n_lines}")
+    degree_u, degree_v = params.degree_u, min(params.degree_v, lines.n_lines - 1)
+    u = centripetal(lines.points, lines.line)
+    along = refine_curves(Rows(u, lines.line, lines.points[:, None]), degree_u, params.bound_u, params.knots_per_pass)
+    columns = along.control_points[:, :, 0]  # (lines, nu, 3)
+    v = mean_centripetal(columns)
+    one_row = Rows(v, np.zeros(lines.n_lines, dtype=np.int64), columns)
+    across = refine_curves(one_row, degree_v, params.bound_v, params.knots_per_pass)
+    control_points = np.swapaxes(across.control_points[0], 0, 1)
+    spline = TensorSpline(degree_u, degree_v, along.knots, across.knots, control_points)
+    distances = np.linalg.norm(evaluate_surface(spline, u, v[lines.line]) - lines.points, axis=1)
+    line_blocks, correlation_u = _propagate_along(lines, u, along, degree_u)
+    blocks, correlation_v = _propagate_across(line_blocks, v, across, degree_v)
+    return SurfaceFit(
+        spline,
+        blocks,
+        correlation_u,
+        correlation_v,
+        u,
+        v,
+        residuals_of(distances),
+        float(along.errors.max()),
+        float(across.errors.max()),
+    )
+
+
+def mean_centripetal(columns: Array) -> Array:
+    """Common parameters (lines,) of columns (lines, k, 3): centripetal ones of each column, averaged over the columns.
+
+    Columns that do not move (the pole of a rotation) say nothing and do not count.
+    """
+    steps = np.sqrt(np.linalg.norm(np.diff(columns, axis=0), axis=2))
+    totals = steps.sum(axis=0)
+    moving = totals > 1e-6
+    if not moving.any():
+        return np.linspace(0.0, 1.0, len(columns))
+    v = np.concatenate([[0.0], np.cumsum((steps[:, moving] / totals[moving]).mean(axis=1))])
+    v /= v[-1]
+    return v
+
+
+def _propagate_along(lines: ScanLines, u: Array, along: CurveFit, degree: int) -> tuple[Array, Array]:
+    """C_P = A C_Q A' along the scan lines, Eq. (32): blocks (lines, nu, 6), mean correlation (nu, nu).
+
+    A = (N'N)^-1 N', and A A' = (N'N)^-1 gives the correlation under equal noise.
+    """
+    n_control = along.control_points.shape[1]
+    blocks = np.empty((lines.n_lines, n_control, 6))
+    correlation = np.zeros((n_control, n_control))
+    starts = np.searchsorted(lines.line, np.arange(lines.n_lines + 1))
+    for k, (start, stop) in enumerate(itertools.pairwise(starts)):
+        N = design_matrix(along.knots, degree, u[start:stop])
+        A = leastsquares.solve(along.factor[:, k * n_control : (k + 1) * n_control], N.T)
+        blocks[k] = A**2 @ lines.covariances[start:stop]
+        correlation += _correlation(A @ A.T)
+    return blocks, correlation / lines.n_lines
+
+
+def _propagate_across(blocks: Array, v: Array, across: CurveFit, degree: int) -> tuple[Array, Array]:
+    """C_P = A C A' across the scan lines, Eq. (33): blocks (nu, nv, 6), correlation (nv, nv).
+
+    Exact for the blocks: the lines' sensor noise is independent.
+    """
+    A = leastsquares.solve(across.factor, design_matrix(across.knots, degree, v).T)
+    return np.einsum("jl,lik->ijk", A**2, blocks), _correlation(A @ A.T)
+
+
+def _correlation(covariance: Array) -> Array:
+    scale = 1.0 / np.sqrt(np.diag(covariance))
+    return (covariance + covariance.T) / 2 * scale[:, None] * scale
+
+
+def residuals_of(distances: Array) -> Residuals:
+    """Statistics of distances (n,), metres."""
+    return Residuals(
+        points=len(distances),
+        mean=float(distances.mean()),
+        rms=float(np.sqrt(np.mean(distances**2))),
+        percentile_95=float(np.percentile(distances, 95)),
+        maximum=float(distances.max()),
+    )

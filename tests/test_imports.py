@@ -12,7 +12,7 @@ import bsmap_cli
 
 PACKAGE = Path(bsmap_cli.__file__).parent
 BASE = {"errors", "model", "params", "track"}
-STAGES = {"slam", "cloud", "fit", "merge", "export", "simulate", "evaluate"}
+STAGES = {"slam", "cloud", "fit", "merge", "export", "simulate", "evaluate", "picture"}
 BELOW_STAGES = {"core", "open3d_loader"} | BASE
 ALLOWED = {
     "errors": set(),

@@ -14,8 +14,8 @@ KEY = "bsmap-provenance"
 # glTF's y points up, the map's z: the root node turns one into the other, the vertices stay in map.
 T_GLTF_MAP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
-PLY_LINE = 1000
-"""Longest comment: the reader in Open3D and CloudCompare (RPly) gives up, or crashes, at lines of 1024 characters."""
+COMMENT_WIDTH = 400
+"""Longest comment of a PLY: MeshLab's reader takes lines of 511 characters, that of Open3D crashes at 1024."""
 
 
 class NamedMesh(NamedTuple):
@@ -41,10 +41,11 @@ def provenance_line(provenance: Mapping[str, Any]) -> str:
     return f"{KEY}:" + json.dumps(provenance, separators=(",", ":"))
 
 
-def _ply_comment(provenance: Mapping[str, Any]) -> str:
-    """As much of the provenance as a line of PLY holds: all, all but the figures, the fingerprint."""
-    lines = (provenance_line(provenance), provenance_line({**provenance, "figures": {}}))
-    return next((line for line in lines if len(line) <= PLY_LINE), str(provenance["fingerprint"]))
+def _ply_comments(provenance: Mapping[str, Any]) -> list[str]:
+    """The line in pieces, which `io.artifact.join_comments` joins again."""
+    line = provenance_line(provenance)
+    pieces = [line[i : i + COMMENT_WIDTH] for i in range(0, len(line), COMMENT_WIDTH)]
+    return [pieces[0], *("bsmap+:" + piece for piece in pieces[1:])]
 
 
 def write_ply(meshes: Sequence[NamedMesh], provenance: Mapping[str, Any] | None) -> bytes:
@@ -52,7 +53,7 @@ def write_ply(meshes: Sequence[NamedMesh], provenance: Mapping[str, Any] | None)
     vertices = np.concatenate([_ply_vertices(mesh) for _, mesh in meshes])
     faces = np.concatenate([_ply_faces(mesh, index) for index, (_, mesh) in enumerate(meshes)])
     faces["vertex_indices"] += np.repeat(_offsets(meshes), [len(m.triangles) for _, m in meshes])[:, None]
-    comments = [_ply_comment(provenance)] if provenance else []
+    comments = _ply_comments(provenance) if provenance else []
     comments += ["frame map, metres", *(f"surface {index} {name}" for index, (name, _) in enumerate(meshes))]
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {c}" for c in comments)]
     header += [f"element vertex {len(vertices)}", *(f"property double {c}" for c in "xyz")]

@@ -12,7 +12,7 @@ from mcap.writer import CompressionType, Writer
 from bsmap_cli.errors import BadInputError, CannotWriteError, MissingInputError
 from bsmap_cli.io import ros
 from bsmap_cli.io.artifact import Provenance, read_provenance
-from bsmap_cli.io.log import OdometryRow, ScanRow, describe_log, interpolate_poses, read_log, write_log, write_scans
+from bsmap_cli.io.log import OdometryRow, ScanRow, describe_log, read_log, write_log, write_scans
 from bsmap_cli.io.mcap_file import ros_writer
 from bsmap_cli.model import LaserScans
 from bsmap_cli.params import LogParams
@@ -135,6 +135,7 @@ def test_two_lasers_without_mounts_are_refused_unless_named(tmp_path: Path) -> N
     write_topics(path, {"/a": ("one", None, 5), "/b": ("two", UPRIGHT, 5), "/c": ("three", None, 5)})
     with pytest.raises(BadInputError, match=r"no transform to base_link on /tf_static for /a \(one\), /c \(three\)"):
         read_log(path)
+    assert {topic.topic for topic in describe_log(path).topics} == {"/tf_static", "/odom", "/a", "/b", "/c"}
     assert read_log(path, LogParams(horizontal_topic="/a")).vertical is not None
     with pytest.raises(BadInputError, match=r"/c: /tf_static has no transform from three to base_link"):
         read_log(path, LogParams(horizontal_topic="/a", vertical_topic="/c"))
@@ -184,18 +185,13 @@ def test_scans_far_outside_the_odometry_are_reported(tmp_path: Path, caplog: pyt
     np.testing.assert_allclose(read.odometry[-1, :2], poses[-1, :2])
 
 
-def test_interpolation_goes_the_short_way_round() -> None:
-    times, poses = np.array([0, 10, 20, 20]), np.array([[0, 0, 3.0], [1, 0, -3.0], [9, 9, 0], [2, 2, -2.0]])
-    result = interpolate_poses(times, poses, np.array([-5, 5, 10, 15, 20, 99]))
-    np.testing.assert_allclose(result[:, 0], [0, 0.5, 1, 1.5, 2, 2])
-    np.testing.assert_allclose(result[1, 2], np.pi)
-    np.testing.assert_allclose(np.exp(1j * result[[2, 4, 5], 2]), np.exp(1j * np.array([-3.0, -2.0, -2.0])))
-
-
-def test_interpolation_is_exact_at_stamps_of_today() -> None:
-    times = START + np.arange(5) * 7
-    poses = np.random.default_rng(0).normal(size=(5, 3))
-    np.testing.assert_array_equal(interpolate_poses(times, poses, times)[:, :2], poses[:, :2])
+def test_of_odometry_with_one_stamp_the_last_counts(tmp_path: Path) -> None:
+    path, base = tmp_path / "log.mcap", replace(lasers()[0], topic="/s", frame_id="laser")
+    rows: list[Any] = [OdometryRow(START + t, (x, 0.0, 3.0)) for t, x in ((0, 0.0), (10, 1.0), (10, 7.0), (20, 9.0))]
+    write_log(path, [*rows, *(ScanRow(START + t, base, base.ranges[0]) for t in (10, 20))], {"laser": np.eye(4)})
+    odometry_at_scans = read_log(path).odometry
+    assert odometry_at_scans is not None
+    np.testing.assert_array_equal(odometry_at_scans[:, 0], [7.0, 9.0])
 
 
 def test_description_names_the_parts(log: Path) -> None:

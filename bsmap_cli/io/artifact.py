@@ -31,6 +31,9 @@ from bsmap_cli.io.completeness import is_complete
 HEAD_BYTES = 65536
 _FINGERPRINT = re.compile(rb"bsmap-fingerprint:([0-9a-f]{40,64})")
 _PROVENANCE = re.compile(r'bsmap-provenance"?\s*:\s*(?={)')
+# Other programs' PLY readers take lines of 511 characters (VCG in MeshLab) or 1023 (RPly in Open3D, CloudCompare).
+COMMENT_WIDTH = 400
+_CONTINUED = "bsmap+:"
 # A stage's code beside core/, io/, model.py and params.py, where it is not just the room of its name.
 _ROOMS = {"merge": ("merge", "fit")}
 
@@ -125,8 +128,8 @@ def file_digest(path: Path | str) -> str:
 
 @cache
 def code_digest(stage: str) -> str:
-    """SHA-256 of the sources that a stage's result depends on."""
-    package = Path(__file__).resolve().parent.parent
+    """SHA-256 of the sources that a stage's result depends on; the stage's room is the first word of its name."""
+    stage, package = stage.split()[0], Path(__file__).resolve().parent.parent
     sources = [package / "model.py", package / "params.py"]
     for room in ("core", "io", *_ROOMS.get(stage, (stage,))):
         sources += [package / f"{room}.py", *(package / room).rglob("*.py")]
@@ -206,7 +209,7 @@ def read_provenance(path: Path | str) -> Provenance | None:
     BadInputError
         There is one, but it cannot be understood.
     """
-    head = read_head(path, 1 << 20).decode("utf-8", errors="replace")
+    head = join_comments(read_head(path, 1 << 20).decode("utf-8", errors="replace"))
     found = _PROVENANCE.search(head)
     if found is None:
         return None
@@ -214,6 +217,17 @@ def read_provenance(path: Path | str) -> Provenance | None:
         return Provenance.from_dict(json.JSONDecoder().raw_decode(head, found.end())[0])
     except (KeyError, TypeError, ValueError) as error:
         raise BadInputError(f"{path}: its provenance is damaged ({error}); make the file again") from error
+
+
+def split_comment(line: str) -> list[str]:
+    """A long line as comments of at most COMMENT_WIDTH characters, for `join_comments` to join."""
+    pieces = [line[i : i + COMMENT_WIDTH] for i in range(0, len(line), COMMENT_WIDTH)]
+    return [pieces[0], *(_CONTINUED + piece for piece in pieces[1:])]
+
+
+def join_comments(header: str) -> str:
+    """Header of a PLY file with the comments of `split_comment` joined."""
+    return header.replace(f"\ncomment {_CONTINUED}", "")
 
 
 def is_up_to_date(path: Path | str, wanted: str) -> bool:

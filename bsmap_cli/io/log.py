@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bsmap_cli.core import se2
 from bsmap_cli.errors import BadInputError
 from bsmap_cli.io import ros
 from bsmap_cli.io.artifact import Provenance
@@ -74,7 +75,8 @@ def _odometry_at(topics: LogTopics, params: LogParams, time_ns: IntArray, log_ti
         logger.warning(
             "%s: %d scans lie outside the time of the odometry, up to %.1f s", topics.path, outside, gap.max() / 1e9
         )
-    return interpolate_poses(times, np.array(odometry.poses), at)
+    last = np.append(np.diff(times) > 0, True)  # of poses with one time the last one counts
+    return se2.interpolate(times[last], np.array(odometry.poses)[last], at)
 
 
 def _common_clock(
@@ -89,17 +91,6 @@ def _common_clock(
     reason = "have no time in common" if ordered else "step back in time"
     logger.warning("%s: stamps of scans and odometry %s; lined up by the time of logging", path, reason)
     return log_time, np.maximum.accumulate(log_times)
-
-
-def interpolate_poses(times: IntArray, poses: Array, at: IntArray) -> Array:
-    """Poses (n, 3) at the times `at` (n,), between poses (m, 3) at `times` (m,) in order; held beyond both ends.
-
-    x and y go straight, theta along the shorter arc. Of poses with one time the last one counts.
-    """
-    last = np.append(np.diff(times) > 0, True)
-    clock, x = (times[last] - times[0]).astype(float), (at - times[0]).astype(float)
-    columns = poses[last, 0], poses[last, 1], np.unwrap(poses[last, 2])
-    return np.column_stack([np.interp(x, clock, column) for column in columns])
 
 
 class ScanRow(NamedTuple):
@@ -208,15 +199,21 @@ class LogDescription:
 
 
 def describe_log(path: Path | str, params: LogParams | None = None) -> LogDescription:
-    """Topics, counts, rates, time span and mounts of a log, and which topic plays which part; raises as `read_log`."""
+    """Topics, counts, rates, time span and mounts of a log, and which topic plays which part.
+
+    A part that cannot be told is a warning. Raises MissingInputError and BadInputError for what is no log at all.
+    """
     params = params or LogParams()
     topics = read_topics(path)
     parts, mounts = {"/tf_static": "mounts"}, mounts_of(topics)
-    for plane, wanted in (("horizontal", params.horizontal_topic), ("vertical", params.vertical_topic)):
-        if found := find_part(topics, mounts, plane, wanted):
-            parts[found.topic] = plane
-    if topics.odometry:
-        parts[_odometry_topic(topics, params.odometry_topic)] = "odometry"
+    try:
+        for plane, wanted in (("horizontal", params.horizontal_topic), ("vertical", params.vertical_topic)):
+            if found := find_part(topics, mounts, plane, wanted):
+                parts[found.topic] = plane
+        if topics.odometry:
+            parts[_odometry_topic(topics, params.odometry_topic)] = "odometry"
+    except BadInputError as error:
+        logger.warning("%s", error)
     described = [_describe(topics, topic, parts.get(topic, "")) for topic in topics.log_times]
     known = {topic: mount for topic, mount in mounts.items() if mount is not None}
     times = [t for topic in topics.log_times.values() for t in topic]

@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 
 from bsmap_cli.errors import BadInputError, MissingInputError
-from bsmap_cli.io.artifact import Provenance
+from bsmap_cli.io.artifact import Provenance, atomic_output, split_comment
 from bsmap_cli.model import Array, IntArray
 
 
 def write_mesh(path: Path | str, vertices: Array, triangles: IntArray, provenance: Provenance | None = None) -> None:
-    """Binary PLY of vertices (n, 3), metres, and triangles (m, 3)."""
+    """Binary PLY of vertices (n, 3), metres, and triangles (m, 3); CannotWriteError where that fails."""
     from plyfile import PlyData, PlyElement
 
     points = np.empty(len(vertices), dtype=[("x", "f8"), ("y", "f8"), ("z", "f8")])
@@ -18,8 +18,9 @@ def write_mesh(path: Path | str, vertices: Array, triangles: IntArray, provenanc
     faces = np.empty(len(triangles), dtype=[("vertex_indices", "i4", (3,))])
     faces["vertex_indices"] = triangles
     elements = [PlyElement.describe(points, "vertex"), PlyElement.describe(faces, "face")]
-    comments = [provenance.to_line()] if provenance else []
-    PlyData(elements, byte_order="<", comments=comments).write(str(path))
+    comments = split_comment(provenance.to_line()) if provenance else []
+    with atomic_output(path) as temporary:
+        PlyData(elements, byte_order="<", comments=comments).write(str(temporary))
 
 
 def read_mesh(path: Path | str) -> tuple[Array, IntArray]:

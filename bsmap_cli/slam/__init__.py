@@ -61,7 +61,8 @@ def run_slam(log: ScanLog, params: SlamParams, *, track: Track = silent) -> Slam
         if k > 0:
             state = filter.predict(state, moved.increment, moved.noise)
         matched = 0
-        if k == 0 or _is_key(poses[last_key], state.pose, params):
+        # Without odometry only the scan itself can tell that the robot moved.
+        if k == 0 or log.odometry is None or _is_key(poses[last_key], state.pose, params):
             state, landmarks, matched, nis[k] = _step(state, landmarks, segments, step, params)
             last_key, step = k, step + 1
         poses[k], covariances[k] = state.pose, filter.pose_covariance(state)

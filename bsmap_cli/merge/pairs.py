@@ -1,6 +1,6 @@
 """One pair of patches: is there an overlap to merge, and what comes of it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -30,6 +30,9 @@ LEAST_SAMPLES = 16
 """Fewest samples of a pair whose agreement is worth a test."""
 SPOILT = 2.0
 """Times the bounds by which a merged patch may miss its samples (95%) before the merging is taken back."""
+
+GROWTH = 1.0
+"""Times the control points of both patches that their pieces may have: merging must not make the map larger."""
 
 Naming = Callable[[str], str]
 """Gives a new name to a piece of the surface of that name."""
@@ -127,14 +130,22 @@ def merge_pair(overlap: Overlap, params: MergeParams, naming: Naming) -> Merging
     fused = fuse(first, second, pairing, params)
     if 2 * fused.moved < len(pairing.offsets):
         return Merging(None, _refused(*names, "most samples differ by more than their covariances allow", figures))
-    fitted = refit(first.surface, pairing, fused)
+    fitted = refit(first.surface, pairing, fused, params)
     figures |= {"moved": float(fused.moved), "gain": fused.gain, "refit_95": fitted.residuals.percentile_95}
     if fitted.residuals.percentile_95 > SPOILT * max(params.bound_u, params.bound_v):
         return Merging(None, _refused(*names, "the merged patch does not follow its samples", figures))
     merged = _merged_patch(first, second, fused, fitted, naming)
     rests = [*_rests(kept, overlap.kept_window, naming), *_rests(replaced, overlap.replaced_window, naming)]
+    before, after = _controls([kept, replaced]), _controls([merged, *rests])
+    figures |= {"control_points_before": float(before), "control_points_after": float(after)}
+    if after > GROWTH * before:
+        return Merging(None, _refused(*names, "the pieces would need more control points than the whole", figures))
     reason = f"they agree; {merged.surface.name} replaces their overlap"
     return Merging([merged, *rests], Decision(*names, "merged", reason, figures))
+
+
+def _controls(patches: Sequence[Patch]) -> int:
+    return sum(int(np.prod(patch.surface.control_points.shape[:2])) for patch in patches)
 
 
 def _figures(agreed: Agreement, pairing: Pairing) -> dict[str, float]:
@@ -160,9 +171,9 @@ def _merged_patch(first: Patch, second: Patch, fused: Fused, fitted: Refit, nami
         first.surface,
         name=naming(root),
         data_sets=tuple(dict.fromkeys([*first.surface.data_sets, *second.surface.data_sets])),
-        knots_u=fitted.knots_u,
-        knots_v=fitted.knots_v,
-        control_points=fitted.control_points,
+        knots_u=fitted.spline.knots_u,
+        knots_v=fitted.spline.knots_v,
+        control_points=fitted.spline.control_points,
         covariance=replace(fitted.covariance, pose=pose),
         residuals=fitted.residuals,
     )

@@ -79,12 +79,12 @@ class Provenance:
         )
 
 
-def _plain(value: Any) -> Any:
+def plain_json(value: Any) -> Any:
     """As JSON knows it: numpy's scalars become Python's, what is not finite becomes a word ("inf")."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(one) for key, one in value.items()}
+        return {str(key): plain_json(one) for key, one in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
+        return [plain_json(one) for one in value]
     scalar = value.item() if hasattr(value, "item") else value
     return str(scalar) if isinstance(scalar, float) and not math.isfinite(scalar) else scalar
 
@@ -100,7 +100,7 @@ def plain_parameters(*params: Any) -> dict[str, Any]:
         if twice := merged.keys() & fields.keys():
             raise ValueError(f"parameters given twice: {sorted(twice)}")
         merged |= fields
-    return {key: _plain(value) for key, value in merged.items()}
+    return {key: plain_json(value) for key, value in merged.items()}
 
 
 def make_provenance(stage: str, parameters: Mapping[str, Any], inputs: Sequence[Path | str]) -> Provenance:

@@ -1,0 +1,213 @@
+"""Checked way from the JSON of surfaces_json.py to the model: what is wrong is told by surface, field and value."""
+
+from typing import Any
+
+import numpy as np
+
+from bsmap_cli.model import (
+    Array,
+    BSplineSurface,
+    DataSet,
+    Decision,
+    PosePart,
+    Residuals,
+    SurfaceCovariance,
+    SurfaceMap,
+)
+
+# Rounding to 4 significant digits, or 6 decimals, makes a singular covariance indefinite by less than these.
+BLOCK_TOLERANCE = 1e-3
+CORRELATION_TOLERANCE = 1e-4
+
+
+class MalformedError(ValueError):
+    """What is wrong in the file, without its name."""
+
+
+def parse_map(plain: dict[str, Any]) -> SurfaceMap:
+    """Surfaces of a file's JSON object; MalformedError where it does not make sense."""
+    surfaces = tuple(_surface(s, f"surfaces[{i}]") for i, s in enumerate(_get(plain, "surfaces", list, "file")))
+    names = [surface.name for surface in surfaces]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise MalformedError(f"surfaces: the name {twice[0]!r} is there twice")
+    return SurfaceMap(
+        surfaces=surfaces,
+        data_sets=tuple(_data_set(d, f"data_sets[{i}]") for i, d in enumerate(_get(plain, "data_sets", list, "file"))),
+        decisions=tuple(_decision(d, f"decisions[{i}]") for i, d in enumerate(_get(plain, "decisions", list, "file"))),
+        notes=_get(plain, "notes", dict, "file"),
+    )
+
+
+def _surface(plain: Any, where: str) -> BSplineSurface:
+    name = _get(plain, "name", str, where)
+    where = f"{where} ({name})"
+    p, q = (_degree(plain, key, where) for key in ("degree_u", "degree_v"))
+    knots_u, knots_v = _knots(plain, "knots_u", p, where), _knots(plain, "knots_v", q, where)
+    nu, nv = len(knots_u) - p - 1, len(knots_v) - q - 1
+    return BSplineSurface(
+        name=name,
+        data_sets=_names(plain, "data_sets", where),
+        degree_u=p,
+        degree_v=q,
+        knots_u=knots_u,
+        knots_v=knots_v,
+        control_points=_array(plain, "control_points", (nu, nv, 3), where),
+        covariance=_covariance(_get(plain, "covariance", dict, where), nu, nv, f"{where}: covariance"),
+        residuals=_residuals(_get(plain, "residuals", dict, where), f"{where}: residuals"),
+    )
+
+
+def _degree(plain: dict[str, Any], key: str, where: str) -> int:
+    degree: int = _get(plain, key, int, where)
+    if degree < 1:
+        raise MalformedError(f"{where}: {key} is {degree}, wanted 1 or more")
+    return degree
+
+
+def _knots(plain: dict[str, Any], key: str, degree: int, where: str) -> Array:
+    """Clamped knot vector on [0, 1], no inner knot more than `degree` times."""
+    knots = _array(plain, key, (None,), where)
+    if len(knots) < 2 * degree + 2:
+        raise MalformedError(f"{where}: {key} has {len(knots)} knots, wanted {2 * degree + 2} or more")
+    down = np.flatnonzero(np.diff(knots) < 0)
+    if len(down):
+        k = int(down[0])
+        raise MalformedError(f"{where}: {key} must ascend, but knot {k} is {knots[k]} and knot {k + 1} {knots[k + 1]}")
+    start, inner, end = knots[: degree + 1], knots[degree + 1 : -degree - 1], knots[-degree - 1 :]
+    if np.any(start != 0.0) or np.any(end != 1.0):
+        raise MalformedError(
+            f"{where}: {key} is not clamped: it must begin with {degree + 1} zeros and end with {degree + 1} ones"
+        )
+    values, counts = np.unique(inner, return_counts=True)
+    for value, count in zip(values.tolist(), counts.tolist(), strict=True):
+        if count > degree or value in (0.0, 1.0):
+            raise MalformedError(f"{where}: {key}: knot {value} is there too often for degree {degree}")
+    return knots
+
+
+def _covariance(plain: dict[str, Any], nu: int, nv: int, where: str) -> SurfaceCovariance:
+    blocks = _array(plain, "blocks", (nu, nv, 6), where)
+    _check_blocks(blocks, where)
+    parts = _get(plain, "pose", list, where)
+    return SurfaceCovariance(
+        blocks=blocks,
+        correlation_u=_correlation(plain, "correlation_u", nu, where),
+        correlation_v=_correlation(plain, "correlation_v", nv, where),
+        pose=tuple(_pose_part(part, f"{where}: pose[{i}]") for i, part in enumerate(parts)),
+    )
+
+
+def _check_blocks(blocks: Array, where: str) -> None:
+    eigenvalues = np.linalg.eigvalsh(blocks[..., [[0, 1, 2], [1, 3, 4], [2, 4, 5]]])
+    bad = np.argwhere(eigenvalues[..., 0] < -BLOCK_TOLERANCE * np.abs(eigenvalues).max(axis=-1))
+    if len(bad):
+        i, j = bad[0].tolist()
+        raise MalformedError(
+            f"{where}: blocks[{i}][{j}] is not positive semidefinite (eigenvalue {eigenvalues[i, j, 0]:.3g})"
+        )
+
+
+def _correlation(plain: dict[str, Any], key: str, n: int, where: str) -> Array:
+    matrix = _symmetric(_array(plain, key, (n * (n + 1) // 2,), where), n)
+    if np.any(np.abs(np.diag(matrix) - 1.0) > 1e-5):
+        raise MalformedError(f"{where}: {key} has a diagonal that is not 1")
+    lowest = float(np.linalg.eigvalsh(matrix)[0])
+    if lowest < -CORRELATION_TOLERANCE:
+        raise MalformedError(f"{where}: {key} is not positive semidefinite (eigenvalue {lowest:.3g})")
+    return matrix
+
+
+def _symmetric(upper: Array, n: int) -> Array:
+    matrix = np.zeros((n, n))
+    matrix[np.triu_indices(n)] = upper
+    return matrix + np.triu(matrix, 1).T
+
+
+def _pose_part(plain: Any, where: str) -> PosePart:
+    covariance = _symmetric(_array(plain, "covariance", (6,), where), 3)
+    eigenvalues = np.linalg.eigvalsh(covariance)
+    if eigenvalues[0] < -BLOCK_TOLERANCE * np.abs(eigenvalues).max():
+        raise MalformedError(f"{where}: covariance is not positive semidefinite (eigenvalue {eigenvalues[0]:.3g})")
+    return PosePart(
+        data_set=_get(plain, "data_set", str, where),
+        centre=_array(plain, "centre", (2,), where),
+        covariance=covariance,
+        weight=_number(plain, "weight", where),
+    )
+
+
+def _residuals(plain: dict[str, Any], where: str) -> Residuals:
+    return Residuals(
+        points=_count(plain, "points", where),
+        **{name: _number(plain, name, where) for name in ("mean", "rms", "percentile_95", "maximum")},
+    )
+
+
+def _data_set(plain: Any, where: str) -> DataSet:
+    name, movement = _get(plain, "name", str, where), _get(plain, "movement", str, where)
+    if movement not in ("translation", "rotation"):
+        raise MalformedError(f"{where} ({name}): movement is {movement!r}, wanted translation or rotation")
+    return DataSet(name, movement, *(_count(plain, key, where) for key in ("first_scan", "last_scan", "points")))
+
+
+def _decision(plain: Any, where: str) -> Decision:
+    outcome = _get(plain, "outcome", str, where)
+    if outcome not in ("merged", "refused"):
+        raise MalformedError(f"{where}: outcome is {outcome!r}, wanted merged or refused")
+    first, second, reason = (_get(plain, key, str, where) for key in ("first", "second", "reason"))
+    return Decision(first, second, outcome, reason, _get(plain, "figures", dict, where))
+
+
+def _get(plain: Any, key: str, kind: type, where: str) -> Any:
+    """Value of a key; it must be there and of a JSON type."""
+    if not isinstance(plain, dict):
+        raise MalformedError(f"{where}: is {_short(plain)}, wanted an object")
+    if key not in plain:
+        raise MalformedError(f"{where}: {key} is missing")
+    value = plain[key]
+    if not isinstance(value, kind) or isinstance(value, bool):
+        names = {str: "a string", int: "an integer", list: "a list", dict: "an object"}
+        raise MalformedError(f"{where}: {key} is {_short(value)}, wanted {names[kind]}")
+    return value
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 40 else text[:37] + "..."
+
+
+def _names(plain: dict[str, Any], key: str, where: str) -> tuple[str, ...]:
+    names = _get(plain, key, list, where)
+    if not all(isinstance(name, str) for name in names):
+        raise MalformedError(f"{where}: {key} is {_short(names)}, wanted a list of strings")
+    return tuple(names)
+
+
+def _count(plain: dict[str, Any], key: str, where: str) -> int:
+    count: int = _get(plain, key, int, where)
+    if count < 0:
+        raise MalformedError(f"{where}: {key} is {count}, wanted 0 or more")
+    return count
+
+
+def _number(plain: dict[str, Any], key: str, where: str) -> float:
+    return float(_array(plain, key, (), where))
+
+
+def _array(plain: Any, key: str, shape: tuple[int | None, ...], where: str) -> Array:
+    """Numbers of a key as an array of `shape` (None: any length), all finite."""
+    value = _get(plain, key, object, where)
+    try:
+        array = np.array(value)
+    except ValueError:
+        raise MalformedError(f"{where}: {key}: its rows are of different lengths") from None
+    if array.dtype.kind not in "iuf":
+        raise MalformedError(f"{where}: {key} is {_short(value)}, wanted numbers")
+    if len(array.shape) != len(shape) or any(s not in (None, g) for s, g in zip(shape, array.shape, strict=True)):
+        got, wanted = (" x ".join(str(s or "any") for s in sizes) or "one number" for sizes in (array.shape, shape))
+        raise MalformedError(f"{where}: {key} is {got}, wanted {wanted}")
+    bad = np.argwhere(~np.isfinite(array))
+    if len(bad):
+        index = "".join(f"[{i}]" for i in bad[0].tolist())
+        raise MalformedError(f"{where}: {key}{index} is {array[tuple(bad[0])]}, wanted a finite number")
+    return array.astype(float)

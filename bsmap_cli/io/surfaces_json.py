@@ -1,0 +1,165 @@
+"""The artifact of `fit` and `merge`: B-spline surfaces as JSON (.surfaces.json, .map.json; .gz by name).
+
+    {"format": "bsmap-surfaces", "version": 1, "units": "metres, radians, frame map",
+     "bsmap-provenance": {...},
+     "data_sets": [{"name", "movement": "translation" | "rotation", "first_scan", "last_scan", "points"}, ...],
+     "surfaces": [surface, ...],
+     "decisions": [{"first", "second", "outcome": "merged" | "refused", "reason", "figures": {...}}, ...],
+     "notes": {...}}
+
+    surface = {"name", "data_sets": [names],
+     "degree_u", "degree_v",
+     "knots_u", "knots_v":     full clamped knot vectors on [0, 1]: nu + degree_u + 1 and nv + degree_v + 1 numbers
+     "control_points":         nu x nv x 3; u runs along the scan lines, v across them
+     "covariance": {
+        "blocks":              nu x nv x 6: xx, xy, xz, yy, yz, zz of the control points' sensor part
+        "correlation_u", "correlation_v":   upper triangles row by row, nu (nu + 1) / 2 and nv (nv + 1) / 2 numbers
+        "pose": [{"data_set", "centre": [x, y], "covariance": [xx, xy, xt, yy, yt, tt], "weight"}, ...]},
+     "residuals": {"points", "mean", "rms", "percentile_95", "maximum"}}
+
+model.py tells what each of them means. Numbers are rounded to what they are worth, for the bytes of a map matter:
+coordinates and correlations to 1e-6, knots to 1e-10, covariances to 4 and residuals to 6 significant digits. A map that
+was read is written again byte for byte.
+"""
+
+import gzip
+import json
+import zlib
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bsmap_cli.errors import BadInputError, MissingInputError
+from bsmap_cli.io.artifact import Provenance, atomic_output, plain_json
+from bsmap_cli.io.surfaces_check import MalformedError, parse_map
+from bsmap_cli.model import Array, BSplineSurface, PosePart, SurfaceCovariance, SurfaceMap
+
+FORMAT = "bsmap-surfaces"
+VERSION = 1
+
+
+def write_surfaces(path: Path | str, surfaces: SurfaceMap, provenance: Provenance | None = None) -> None:
+    """Write surfaces, one a line; gzip where the name ends in .gz.
+
+    Raises
+    ------
+    CannotWriteError
+        The file cannot be written.
+    ValueError
+        A number is not finite.
+    """
+    head = {"format": FORMAT, "version": VERSION, "units": "metres, radians, frame map"}
+    if provenance is not None:
+        head |= {"bsmap-provenance": provenance.to_dict()}
+    parts = [
+        _dumps(head)[1:-1],
+        _list("data_sets", [plain_json(asdict(data_set)) for data_set in surfaces.data_sets]),
+        _list("surfaces", [_surface(surface) for surface in surfaces.surfaces]),
+        _list("decisions", [plain_json(asdict(decision)) for decision in surfaces.decisions]),
+        f'"notes":{_dumps(plain_json(surfaces.notes))}',
+    ]
+    content = ("{" + ",\n".join(parts) + "}\n").encode()
+    with atomic_output(path) as temporary:
+        packed = str(path).endswith(".gz")
+        temporary.write_bytes(gzip.compress(content, 9, mtime=0) if packed else content)
+
+
+def _dumps(value: Any) -> str:
+    return json.dumps(value, separators=(",", ":"), allow_nan=False)
+
+
+def _list(key: str, values: list[Any]) -> str:
+    return f'"{key}":[\n' + ",\n".join(map(_dumps, values)) + "]"
+
+
+def _surface(surface: BSplineSurface) -> dict[str, Any]:
+    residuals = surface.residuals
+    return {
+        "name": surface.name,
+        "data_sets": list(surface.data_sets),
+        "degree_u": int(surface.degree_u),
+        "degree_v": int(surface.degree_v),
+        "knots_u": _rounded(surface.knots_u, 10),
+        "knots_v": _rounded(surface.knots_v, 10),
+        "control_points": _rounded(surface.control_points, 6),
+        "covariance": _covariance(surface.covariance),
+        "residuals": {"points": int(residuals.points)}
+        | {name: _significant(value, 6) for name, value in asdict(residuals).items() if name != "points"},
+    }
+
+
+def _covariance(covariance: SurfaceCovariance) -> dict[str, Any]:
+    return {
+        "blocks": _significant(covariance.blocks, 4),
+        "correlation_u": _rounded(_upper(covariance.correlation_u), 6),
+        "correlation_v": _rounded(_upper(covariance.correlation_v), 6),
+        "pose": [_pose_part(part) for part in covariance.pose],
+    }
+
+
+def _pose_part(part: PosePart) -> dict[str, Any]:
+    return {
+        "data_set": part.data_set,
+        "centre": _rounded(part.centre, 6),
+        "covariance": _significant(_upper(part.covariance), 4),
+        "weight": float(part.weight),
+    }
+
+
+def _upper(matrix: Array) -> Array:
+    """Upper triangle of a symmetric matrix, row by row."""
+    return np.asarray(matrix)[np.triu_indices(len(matrix))]
+
+
+def _rounded(values: Array, decimals: int) -> Any:
+    return (np.round(np.asarray(values, dtype=float), decimals) + 0.0).tolist()  # + 0.0 turns -0.0 into 0.0
+
+
+def _significant(values: Any, digits: int) -> Any:
+    """Nested lists of the values rounded to significant digits."""
+    array = np.asarray(values, dtype=float) + 0.0
+    rounded = [float(f"{value:.{digits - 1}e}") for value in array.ravel().tolist()]
+    return np.array(rounded).reshape(array.shape).tolist()
+
+
+def read_surfaces(path: Path | str) -> SurfaceMap:
+    """Read surfaces, and check all of them.
+
+    Raises
+    ------
+    MissingInputError
+        There is no such file.
+    BadInputError
+        It is not such a file, of another version, cut, or wrong in itself; the message names surface, field and value.
+    """
+    plain = _load(path)
+    try:
+        return parse_map(plain)
+    except MalformedError as error:
+        raise BadInputError(f"{path}: {error}") from error
+
+
+def _content(path: Path | str) -> bytes:
+    try:
+        content = Path(path).read_bytes()
+        return gzip.decompress(content) if content.startswith(b"\x1f\x8b") else content
+    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+        raise BadInputError(f"{path}: was cut or is damaged ({error}); make it again") from error
+    except OSError as error:
+        raise MissingInputError(f"{path}: {error.strerror or error}") from error
+
+
+def _load(path: Path | str) -> dict[str, Any]:
+    try:
+        plain = json.loads(_content(path))
+    except ValueError as error:  # UnicodeDecodeError and JSONDecodeError are ValueErrors
+        raise BadInputError(f"{path}: is not JSON, or was cut ({error}); make it again") from error
+    if not isinstance(plain, dict) or plain.get("format") != FORMAT:
+        raise BadInputError(f"{path}: is JSON, but not surfaces of bsmap (its `format` is not {FORMAT!r})")
+    if plain.get("version") != VERSION:
+        raise BadInputError(
+            f"{path}: is of version {plain.get('version')!r}, this bsmap reads {VERSION}; make it again"
+        )
+    return plain

@@ -14,6 +14,7 @@ DEBIAN_PACKAGES = {
     "libX11": "libx11-6",
     "libgomp": "libgomp1",
     "libudev": "libudev1",
+    "libidn2": "libidn2-0",
 }
 
 

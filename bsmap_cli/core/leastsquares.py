@@ -12,6 +12,9 @@ from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
 from bsmap_cli.errors import BsmapError
 from bsmap_cli.model import Array
 
+SINGULAR = 1e-8
+"""Share of a column's square that must be its own."""
+
 
 def normal_matrix(first: NDArray[np.intp], values: Array, columns: int) -> Array:
     """Lower bands (b, columns) of N'N: element [d, j] is (N'N)[j + d, j].
@@ -42,13 +45,18 @@ def factorise(normal: Array) -> Array:
     Raises
     ------
     BsmapError
-        Where the matrix is not positive definite: some unknown has too few data (Schoenberg-Whitney).
+        Where the matrix is singular, or so nearly that half of the digits would be lost: some unknown has too few data
+        (Schoenberg-Whitney).
     """
     try:
-        return cholesky_banded(normal, lower=True)
-    except LinAlgError as error:
+        factor = cholesky_banded(normal, lower=True)
+    except LinAlgError:
+        factor = None
+    # The square of a pivot is what the unknowns before it leave of the column.
+    if factor is None or np.any(factor[0] ** 2 < SINGULAR * normal[0]):
         message = f"least squares with {normal.shape[1]} unknowns is underdetermined: a knot span lacks data"
-        raise BsmapError(message) from error
+        raise BsmapError(message)
+    return factor
 
 
 def solve(factor: Array, right: Array) -> Array:
@@ -60,3 +68,16 @@ def fit(first: NDArray[np.intp], values: Array, data: Array, columns: int) -> tu
     """Least-squares solution (columns, k) of N X = data (n, k), and the factor of N'N for more."""
     factor = factorise(normal_matrix(first, values, columns))
     return solve(factor, right_side(first, values, data, columns)), factor
+
+
+def block_variances(factor: Array, blocks: int, columns: NDArray[np.intp]) -> Array:
+    """Diagonal elements (blocks, k) of (N'N)^-1 for unknowns `columns` (k,) of each of the equal, uncoupled blocks.
+
+    The variance of an unknown where every datum has variance 1.
+    """
+    size = factor.shape[1] // blocks
+    # One right side serves all blocks: a one in each of them.
+    right = np.zeros((blocks, size, len(columns)))
+    right[:, columns, np.arange(len(columns))] = 1.0
+    solution = solve(factor, right.reshape(blocks * size, -1)).reshape(right.shape)
+    return solution[:, columns, np.arange(len(columns))]

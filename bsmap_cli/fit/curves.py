@@ -11,7 +11,11 @@ from numpy.typing import NDArray
 
 from bsmap_cli.core import leastsquares
 from bsmap_cli.core.bspline import basis_functions, clamped_knots, inner_knots, open_knots
+from bsmap_cli.errors import BsmapError
 from bsmap_cli.model import Array, IntArray
+
+LARGEST_VARIANCE = 10.0
+"""Of a control point, where every data point has variance 1; with more, the data do not determine it."""
 
 
 class Rows(NamedTuple):
@@ -19,11 +23,13 @@ class Rows(NamedTuple):
 
     u : (n,) parameters from 0 to 1.  row : (n,) number of the curve, 0 ... rows - 1, ascending.
     data : (n, k, 3), k points at each parameter, each of a curve of its own (k = 1 for plain curves), metres.
+    allowance : (n, k) metres by which a point's error may exceed the bound: its noise.
     """
 
     u: Array
     row: IntArray
     data: Array
+    allowance: Array
 
     @property
     def n_rows(self) -> int:
@@ -36,7 +42,7 @@ class CurveFit(NamedTuple):
 
     knots : (n_control + degree + 1,).  control_points : (rows, n_control, k, 3).
     factor : (degree + 1, rows * n_control), Cholesky factor of all rows' N'N, block after block.
-    errors : (n,) metres, distance of each data point to its curve at its parameter (the largest of the k).
+    errors : (n, k) metres, distance of each data point to its curve at its parameter.
     """
 
     knots: Array
@@ -81,7 +87,7 @@ def fit_curves(rows: Rows, knots: Array, degree: int) -> CurveFit:
     fitted = np.zeros_like(flat)
     for r in range(degree + 1):
         fitted += values[:, r, None] * solution[first + r + rows.row * n_control]
-    errors = np.linalg.norm((fitted - flat).reshape(rows.data.shape), axis=2).max(axis=1)
+    errors = np.linalg.norm((fitted - flat).reshape(rows.data.shape), axis=2)
     control_points = solution.reshape(rows.n_rows, n_control, *rows.data.shape[1:])
     return CurveFit(knots, control_points, factor, errors)
 
@@ -90,49 +96,88 @@ def refine_curves(rows: Rows, degree: int, bound: float, knots_per_pass: int) ->
     """Curves with as many common knots as the bound needs, or as the data bear.
 
     Each pass inserts up to `knots_per_pass` knots at the parameters of the worst points over all rows, and fits again
-    (the paper inserts one). It ends when no error exceeds `bound`, or when no knot can be added without leaving a span
-    of some row without data: then the bound lies below the noise, or below what jumps between the points allow.
+    (the paper inserts one). It ends when no error exceeds `bound` and its allowance, or when no knot can be added
+    without leaving some row's control points undetermined: then the bound lies below the noise, or a jump cannot be
+    followed. Where the worst point cannot become a knot for that, the middle of its span is tried: there we leave the
+    paper, which does not say what to do.
 
     Raises BsmapError where a row has less than degree + 1 points.
     """
-    knots = open_knots(degree)
-    while True:
-        fit = fit_curves(rows, knots, degree)
-        if fit.errors.max() <= bound:
-            return fit
-        refined = _add_knots(rows, fit, degree, bound, knots_per_pass)
-        if len(refined) == len(knots):
-            return fit
-        knots = refined
-
-
-def _add_knots(rows: Rows, fit: CurveFit, degree: int, bound: float, count: int) -> Array:
-    """Knots with up to `count` more, at most one a span, where the error is worst and the data allow it."""
-    breaks = np.unique(fit.knots)
-    span = np.clip(np.searchsorted(breaks, rows.u, side="right") - 1, 0, len(breaks) - 2)
-    lowest, highest = _common_interval(rows, span, len(breaks) - 1)
-    allowed = (rows.u > lowest[span]) & (rows.u <= highest[span]) & (rows.u < 1.0)
-    candidates = np.flatnonzero(allowed & (fit.errors > bound))
-    knots = fit.knots
-    taken: set[int] = set()
-    for index in candidates[np.argsort(-fit.errors[candidates], kind="stable")]:
-        if len(taken) == count:
+    fit = fit_curves(rows, open_knots(degree), degree)
+    barred = np.zeros(len(rows.u), dtype=bool)
+    while (excess := (fit.errors - rows.allowance).max(axis=1)).max() > bound:
+        lowest, highest = _admissible_interval(rows, fit.knots)
+        allowed = (rows.u > lowest) & (rows.u <= highest) & (rows.u < 1.0) & ~barred
+        candidates = np.flatnonzero((excess > bound) & allowed)
+        worst_first = candidates[np.argsort(-excess[candidates], kind="stable")]
+        chosen = _choose(rows, fit.knots, degree, worst_first, knots_per_pass)
+        if not chosen:
             break
-        if span[index] in taken:
+        worst = chosen[0]
+        middle = (lowest[worst] + highest[worst]) / 2
+        refined = _try(rows, fit.knots, degree, rows.u[chosen])
+        refined = refined or _try(rows, fit.knots, degree, rows.u[[worst]])
+        refined = refined or _try(rows, fit.knots, degree, np.array([middle]))
+        if refined is None:
+            barred |= _same_span(rows, fit.knots, worst)
+        else:
+            fit = refined
+    return fit
+
+
+def _try(rows: Rows, knots: Array, degree: int, new: Array) -> CurveFit | None:
+    """Curves with new knots, or None where the data of some row do not determine the control points around them.
+
+    Schoenberg-Whitney alone lets a curve swing wildly where a row has its points just inside the borders of a gap.
+    """
+    knots = _with(knots, degree, new)
+    try:
+        fit = fit_curves(rows, knots, degree)
+    except BsmapError:
+        return None
+    around = np.searchsorted(knots, new)[:, None] + np.arange(-degree - 1, 1)
+    columns = np.unique(np.clip(around, 0, len(knots) - degree - 2))
+    variances = leastsquares.block_variances(fit.factor, rows.n_rows, columns)
+    return fit if variances.max() <= LARGEST_VARIANCE else None
+
+
+def _same_span(rows: Rows, knots: Array, index: int) -> NDArray[np.bool_]:
+    span = np.searchsorted(knots, rows.u, side="right")
+    return span == span[index]
+
+
+def _with(knots: Array, degree: int, new: Array) -> Array:
+    return clamped_knots(degree, np.concatenate([inner_knots(knots, degree), new]))
+
+
+def _choose(rows: Rows, knots: Array, degree: int, candidates: NDArray[np.intp], count: int) -> list[int]:
+    """Up to `count` of the candidates, worst first, at most one a span, that may all become knots."""
+    breaks = np.unique(knots)
+    span = np.searchsorted(breaks, rows.u, side="right")
+    chosen: list[int] = []
+    taken: set[int] = set()
+    for index in candidates.tolist():
+        if len(chosen) == count:
+            break
+        if int(span[index]) in taken:
             continue
-        tried = clamped_knots(degree, np.append(inner_knots(knots, degree), rows.u[index]))
-        if schoenberg_whitney(tried, degree, rows):
-            knots = tried
+        if schoenberg_whitney(_with(knots, degree, rows.u[[*chosen, index]]), degree, rows):
+            chosen.append(index)
             taken.add(int(span[index]))
-    return knots
+    return chosen
 
 
-def _common_interval(rows: Rows, span: NDArray[np.intp], spans: int) -> tuple[Array, Array]:
-    """For each span (spans,) where a knot must lie, lowest < knot <= highest, to leave every row data on both sides."""
+def _admissible_interval(rows: Rows, knots: Array) -> tuple[Array, Array]:
+    """For the span of each point, (n,) and (n,): a knot, lowest < knot <= highest, leaves every row data both sides."""
+    breaks = np.unique(knots)
+    spans = len(breaks) - 1
+    span = np.clip(np.searchsorted(breaks, rows.u, side="right") - 1, 0, spans - 1)
     # Rows ascend in u, and every row has data in every span: the first of each (row, span) are in order.
     first = np.flatnonzero(np.diff(rows.row * spans + span, prepend=-1))
     last = np.append(first[1:], len(span)) - 1
-    return rows.u[first].reshape(-1, spans).max(axis=0), rows.u[last].reshape(-1, spans).min(axis=0)
+    lowest = rows.u[first].reshape(-1, spans).max(axis=0)
+    highest = rows.u[last].reshape(-1, spans).min(axis=0)
+    return lowest[span], highest[span]
 
 
 def schoenberg_whitney(knots: Array, degree: int, rows: Rows) -> bool:

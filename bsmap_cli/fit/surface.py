@@ -19,7 +19,7 @@ class SurfaceFit(NamedTuple):
 
     blocks : (nu, nv, 6) sensor covariance of each control point.  correlation_u : (nu, nu), correlation_v : (nv, nv).
     u : (n,) parameters of the data points.  v : (lines,) parameters of the scan lines.
-    error_u, error_v : metres, largest errors of the curves along and across the scan lines.
+    error_u, error_v : metres, largest errors of the curves along and across the scan lines, beyond their allowance.
     """
 
     spline: TensorSpline
@@ -47,15 +47,16 @@ def fit_scan_lines(lines: ScanLines, params: FitParams) -> SurfaceFit:
         raise BsmapError(f"a surface needs 2 scan lines, here is {lines.n_lines}")
     degree_u, degree_v = params.degree_u, min(params.degree_v, lines.n_lines - 1)
     u = centripetal(lines.points, lines.line)
-    along = refine_curves(Rows(u, lines.line, lines.points[:, None]), degree_u, params.bound_u, params.knots_per_pass)
+    rows = Rows(u, lines.line, lines.points[:, None], _allowance(lines.covariances, params)[:, None])
+    along = refine_curves(rows, degree_u, params.bound_u, params.knots_per_pass)
+    line_blocks, correlation_u = _propagate_along(lines, u, along, degree_u)
     columns = along.control_points[:, :, 0]  # (lines, nu, 3)
     v = mean_centripetal(columns)
-    one_row = Rows(v, np.zeros(lines.n_lines, dtype=np.int64), columns)
-    across = refine_curves(one_row, degree_v, params.bound_v, params.knots_per_pass)
+    row = Rows(v, np.zeros(lines.n_lines, dtype=np.int64), columns, _allowance(line_blocks, params))
+    across = refine_curves(row, degree_v, params.bound_v, params.knots_per_pass)
     control_points = np.swapaxes(across.control_points[0], 0, 1)
     spline = TensorSpline(degree_u, degree_v, along.knots, across.knots, control_points)
     distances = np.linalg.norm(evaluate_surface(spline, u, v[lines.line]) - lines.points, axis=1)
-    line_blocks, correlation_u = _propagate_along(lines, u, along, degree_u)
     blocks, correlation_v = _propagate_across(line_blocks, v, across, degree_v)
     return SurfaceFit(
         spline,
@@ -65,9 +66,14 @@ def fit_scan_lines(lines: ScanLines, params: FitParams) -> SurfaceFit:
         u,
         v,
         residuals_of(distances),
-        float(along.errors.max()),
-        float(across.errors.max()),
+        _excess(rows, along),
+        _excess(row, across),
     )
+
+
+def _allowance(covariances: Array, params: FitParams) -> Array:
+    """Errors (...) in metres that the sensor's noise explains, of packed covariances (..., 6)."""
+    return params.noise_margin * np.sqrt(covariances[..., [0, 3, 5]].sum(axis=-1))
 
 
 def mean_centripetal(columns: Array) -> Array:
@@ -83,6 +89,10 @@ def mean_centripetal(columns: Array) -> Array:
     v = np.concatenate([[0.0], np.cumsum((steps[:, moving] / totals[moving]).mean(axis=1))])
     v /= v[-1]
     return v
+
+
+def _excess(rows: Rows, fit: CurveFit) -> float:
+    return max(0.0, float((fit.errors - rows.allowance).max()))
 
 
 def _propagate_along(lines: ScanLines, u: Array, along: CurveFit, degree: int) -> tuple[Array, Array]:

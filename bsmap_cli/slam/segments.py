@@ -76,7 +76,7 @@ def extract_segments(points: ScanPoints, laser_xy: Array, range_sigma: float, pa
     group_start, group_end = _breakpoints(points, range_sigma, params)
     long_enough = group_end - group_start >= params.min_points
     start, end = _split(points.xy, group_start[long_enough], group_end[long_enough], params)
-    start, end = _merge(points.xy, start, end, range_sigma)
+    start, end = _merge(points.xy, start, end, group_start, range_sigma)
     keep = end - start >= params.min_points
     return _fit(points, start[keep], end[keep], laser_xy, range_sigma, params)
 
@@ -109,10 +109,12 @@ def _split(xy: Array, start: IntArray, end: IntArray, params: SlamParams) -> tup
         count = end - start
         chord = xy[end - 1] - xy[start]
         # Where the ends coincide, the distance to the start takes the place of that to the chord.
-        length = np.maximum(np.hypot(*chord.T), 1e-9)
+        length = np.hypot(*chord.T)
+        closed = length < 1e-6
+        chord /= np.where(closed, 1.0, length)[:, None]
         offset = xy[flat] - np.repeat(xy[start], count, axis=0)
         across = np.abs(offset[:, 0] * np.repeat(chord[:, 1], count) - offset[:, 1] * np.repeat(chord[:, 0], count))
-        distance = across / np.repeat(length, count)
+        distance = np.where(np.repeat(closed, count), np.hypot(*offset.T), across)
         largest = np.maximum.reduceat(distance, first)
         split = largest > params.split_distance
         done.append((start[~split], end[~split]))
@@ -132,7 +134,7 @@ def _split(xy: Array, start: IntArray, end: IntArray, params: SlamParams) -> tup
 def _flatten(start: IntArray, end: IntArray) -> tuple[IntArray, IntArray]:
     """Indices of all points of all segments, one after another, and where each segment begins among them."""
     count = end - start
-    first = np.r_[0, np.cumsum(count)[:-1]]
+    first = np.cumsum(count) - count
     return np.arange(count.sum()) + np.repeat(start - first, count), first
 
 
@@ -154,13 +156,16 @@ def _mean_square(m: Array) -> Array:
     return np.maximum((xx + yy) / 2 - np.sqrt(((xx - yy) / 2) ** 2 + xy**2), 0.0)
 
 
-def _merge(xy: Array, start: IntArray, end: IntArray, range_sigma: float) -> tuple[IntArray, IntArray]:
-    """Join neighbours that touch and that one line fits as well as two."""
+def _merge(
+    xy: Array, start: IntArray, end: IntArray, group_start: IntArray, range_sigma: float
+) -> tuple[IntArray, IntArray]:
+    """Join neighbours of one group that touch and that one line fits as well as two."""
     while len(start) > 1:
         m = _moments(xy, start, end)
         own, joint = _mean_square(m), _mean_square(m[:-1] + m[1:])
         apart = (own[:-1] * m[:-1, 0] + own[1:] * m[1:, 0]) / (m[:-1, 0] + m[1:, 0])
-        join = (start[1:] == end[:-1]) & (joint < np.maximum(1.2 * apart, range_sigma**2))
+        touch = (start[1:] == end[:-1]) & ~np.isin(start[1:], group_start)
+        join = touch & (joint < np.maximum(1.2 * apart, range_sigma**2))
         # In a chain only every other joint is closed in one pass.
         join = _every_other(join)
         if not join.any():

@@ -75,7 +75,7 @@ def extract_segments(points: ScanPoints, laser_xy: Array, range_sigma: float, pa
     """Line segments of many scans; `laser_xy` (2,) is the laser's place in base_link."""
     group_start, group_end = _breakpoints(points, range_sigma, params)
     long_enough = group_end - group_start >= params.min_points
-    start, end = _split(points.xy, group_start[long_enough], group_end[long_enough], params)
+    start, end = _split(points.xy, group_start[long_enough], group_end[long_enough], range_sigma, params)
     start, end = _merge(points.xy, start, end, group_start, range_sigma)
     keep = end - start >= params.min_points
     return _fit(points, start[keep], end[keep], laser_xy, range_sigma, params)
@@ -101,8 +101,10 @@ def _breakpoints(points: ScanPoints, range_sigma: float, params: SlamParams) -> 
     return np.r_[0, inner], np.r_[inner, n]
 
 
-def _split(xy: Array, start: IntArray, end: IntArray, params: SlamParams) -> tuple[IntArray, IntArray]:
-    """Iterative end-point fit, all segments of a level at once."""
+def _split(
+    xy: Array, start: IntArray, end: IntArray, range_sigma: float, params: SlamParams
+) -> tuple[IntArray, IntArray]:
+    """Iterative end-point fit, all segments of a level at once; what noise alone does (4 sigma) splits nothing."""
     done: list[tuple[IntArray, IntArray]] = []
     while len(start):
         flat, first = _flatten(start, end)
@@ -116,7 +118,7 @@ def _split(xy: Array, start: IntArray, end: IntArray, params: SlamParams) -> tup
         across = np.abs(offset[:, 0] * np.repeat(chord[:, 1], count) - offset[:, 1] * np.repeat(chord[:, 0], count))
         distance = np.where(np.repeat(closed, count), np.hypot(*offset.T), across)
         largest = np.maximum.reduceat(distance, first)
-        split = largest > params.split_distance
+        split = largest > max(params.split_distance, 4 * range_sigma)
         done.append((start[~split], end[~split]))
         if not split.any():
             break

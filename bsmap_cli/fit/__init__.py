@@ -19,7 +19,7 @@ logger = logging.getLogger(__name__)
 def fit_surfaces(cloud: PointCloud, params: FitParams, *, track: Track = silent) -> SurfaceMap:
     """Divide the cloud into data sets by movement and fit a surface to each.
 
-    A set with too few scans for a surface is left out; a Decision says so. The notes hold, for each surface, its
+    A set with too few scans or points is left out; a Decision says so. The notes hold, for each surface, its
     largest errors along u and v and whether the bounds are met.
 
     Raises
@@ -35,12 +35,12 @@ def fit_surfaces(cloud: PointCloud, params: FitParams, *, track: Track = silent)
         lines = gather_lines(cloud, movement, params.degree_u + 1)
         first, last = int(movement.scans[0]), int(movement.scans[-1])
         data_sets.append(DataSet(name, movement.kind, first, last, len(lines.points)))
-        if lines.n_lines < 2:
-            reason = f"{lines.n_lines} of {len(movement.scans)} scans have {params.degree_u + 1} points; 2 are needed"
-            refused.append(Decision(name, "", "refused", reason, {"scans": lines.n_lines}))
-            logger.warning("%s left out: %s", name, reason)
+        try:
+            fit = fit_scan_lines(lines, params)
+        except BsmapError as error:
+            refused.append(Decision(name, "", "refused", str(error), {"scans": lines.n_lines}))
+            logger.warning("%s left out: %s", name, error)
             continue
-        fit = fit_scan_lines(lines, params)
         surfaces.append(_as_surface(cloud, movement, name, fit))
         notes[name] = _note(name, lines, fit, params)
     track("data sets", len(movements), len(movements))

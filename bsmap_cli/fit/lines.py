@@ -9,6 +9,9 @@ from bsmap_cli.core.gaussian import pack
 from bsmap_cli.fit.movement import Movement
 from bsmap_cli.model import Array, IntArray, PointCloud, PosePart
 
+LEAST_SHARE = 0.5
+"""Of the median number of points of a data set's scans, that a scan must have."""
+
 
 class ScanLines(NamedTuple):
     """Points of a data set, scan after scan in order of movement, beam after beam.
@@ -28,12 +31,17 @@ class ScanLines(NamedTuple):
 
 
 def gather_lines(cloud: PointCloud, movement: Movement, fewest: int) -> ScanLines:
-    """Scan lines of a data set; scans with less than `fewest` points are left out."""
-    bounds = np.searchsorted(cloud.scan_index, np.stack([movement.scans, movement.scans + 1]))
-    bounds = bounds[:, bounds[1] - bounds[0] >= fewest]
-    ranges = [np.arange(a, b) for a, b in bounds.T]
+    """Scan lines of a data set.
+
+    Scans with less than `fewest` points, or less than half as many as usual in the set, are left out: every knot needs
+    data in every scan line, so that one poor scan would keep the whole surface stiff.
+    """
+    start, stop = np.searchsorted(cloud.scan_index, np.stack([movement.scans, movement.scans + 1]))
+    counts = stop - start
+    kept = np.flatnonzero((counts >= fewest) & (counts >= LEAST_SHARE * np.median(counts)))
+    ranges = [np.arange(start[k], stop[k]) for k in kept]
     index = np.concatenate([*ranges, np.zeros(0, dtype=np.int64)]).astype(np.int64)
-    line = np.repeat(np.arange(len(ranges)), bounds[1] - bounds[0])
+    line = np.repeat(np.arange(len(kept)), counts[kept])
     return ScanLines(cloud.points[index], line, _sensor_covariances(cloud, index))
 
 

@@ -15,7 +15,12 @@ from bsmap_cli.errors import BsmapError
 from bsmap_cli.model import Array, IntArray
 
 LARGEST_VARIANCE = 10.0
-"""Of a control point, where every data point has variance 1; with more, the data do not determine it."""
+"""Of a control point, where every data point has variance 1; with more, its data do not determine it.
+
+Three times that where data are plenty, degree 3; beyond, it grows with the degree as the condition of the basis does.
+"""
+END_SHARE = 0.25
+"""Of a span, that a new knot keeps away from either end."""
 
 
 class Rows(NamedTuple):
@@ -98,8 +103,10 @@ def refine_curves(rows: Rows, degree: int, bound: float, knots_per_pass: int) ->
     Each pass inserts up to `knots_per_pass` knots at the parameters of the worst points over all rows, and fits again
     (the paper inserts one). It ends when no error exceeds `bound` and its allowance, or when no knot can be added
     without leaving some row's control points undetermined: then the bound lies below the noise, or a jump cannot be
-    followed. Where the worst point cannot become a knot for that, the middle of its span is tried: there we leave the
-    paper, which does not say what to do.
+    followed.
+
+    We leave the paper in one point: a knot keeps a share of the span away from the span's ends. Where the worst point
+    lies beside a knot, each pass would put the next knot beside the last one, and knots would creep along the curve.
 
     Raises BsmapError where a row has less than degree + 1 points.
     """
@@ -107,19 +114,18 @@ def refine_curves(rows: Rows, degree: int, bound: float, knots_per_pass: int) ->
     barred = np.zeros(len(rows.u), dtype=bool)
     while (excess := (fit.errors - rows.allowance).max(axis=1)).max() > bound:
         lowest, highest = _admissible_interval(rows, fit.knots)
-        allowed = (rows.u > lowest) & (rows.u <= highest) & (rows.u < 1.0) & ~barred
-        candidates = np.flatnonzero((excess > bound) & allowed)
+        margin = END_SHARE * (highest - lowest)
+        places = np.clip(rows.u, lowest + margin, highest - margin)
+        candidates = np.flatnonzero((excess > bound) & (highest > lowest) & ~barred)
         worst_first = candidates[np.argsort(-excess[candidates], kind="stable")]
-        chosen = _choose(rows, fit.knots, degree, worst_first, knots_per_pass)
+        chosen = _choose(rows, fit.knots, degree, places, worst_first, knots_per_pass)
         if not chosen:
             break
-        worst = chosen[0]
-        middle = (lowest[worst] + highest[worst]) / 2
-        refined = _try(rows, fit.knots, degree, rows.u[chosen])
-        refined = refined or _try(rows, fit.knots, degree, rows.u[[worst]])
-        refined = refined or _try(rows, fit.knots, degree, np.array([middle]))
+        refined = _try(rows, fit.knots, degree, places[chosen])
+        if refined is None and len(chosen) > 1:
+            refined = _try(rows, fit.knots, degree, places[chosen[:1]])
         if refined is None:
-            barred |= _same_span(rows, fit.knots, worst)
+            barred |= _same_span(rows, fit.knots, chosen[0])
         else:
             fit = refined
     return fit
@@ -138,7 +144,7 @@ def _try(rows: Rows, knots: Array, degree: int, new: Array) -> CurveFit | None:
     around = np.searchsorted(knots, new)[:, None] + np.arange(-degree - 1, 1)
     columns = np.unique(np.clip(around, 0, len(knots) - degree - 2))
     variances = leastsquares.block_variances(fit.factor, rows.n_rows, columns)
-    return fit if variances.max() <= LARGEST_VARIANCE else None
+    return fit if variances.max() <= LARGEST_VARIANCE * 3.0 ** max(0, degree - 3) else None
 
 
 def _same_span(rows: Rows, knots: Array, index: int) -> NDArray[np.bool_]:
@@ -150,20 +156,22 @@ def _with(knots: Array, degree: int, new: Array) -> Array:
     return clamped_knots(degree, np.concatenate([inner_knots(knots, degree), new]))
 
 
-def _choose(rows: Rows, knots: Array, degree: int, candidates: NDArray[np.intp], count: int) -> list[int]:
-    """Up to `count` of the candidates, worst first, at most one a span, that may all become knots."""
+def _choose(
+    rows: Rows, knots: Array, degree: int, places: Array, candidates: NDArray[np.intp], count: int
+) -> list[int]:
+    """Up to `count` of the candidates, worst first, one a span, that may have knots at their places (n,)."""
     breaks = np.unique(knots)
     span = np.searchsorted(breaks, rows.u, side="right")
     chosen: list[int] = []
-    taken: set[int] = set()
+    seen: set[int] = set()
     for index in candidates.tolist():
         if len(chosen) == count:
             break
-        if int(span[index]) in taken:
+        if int(span[index]) in seen:
             continue
-        if schoenberg_whitney(_with(knots, degree, rows.u[[*chosen, index]]), degree, rows):
+        seen.add(int(span[index]))
+        if schoenberg_whitney(_with(knots, degree, places[[*chosen, index]]), degree, rows):
             chosen.append(index)
-            taken.add(int(span[index]))
     return chosen
 
 

@@ -65,7 +65,11 @@ class Agreement(NamedTuple):
 
 
 class Fused(NamedTuple):
-    """Merged samples: points (n, m, 3), covariance of the samples, mean gain, samples that moved."""
+    """Merged samples.
+
+    points : (n, m, 3).  covariance : of the samples.  moved : how many are fused.
+    gain : mean over all samples of the share that the second patch has in them.
+    """
 
     points: Array
     covariance: SurfaceCovariance
@@ -206,4 +210,4 @@ def fuse(first: Patch, second: Patch, pairing: Pairing, params: MergeParams) -> 
         pairing.covariance.correlation_v,
         pairing.covariance.pose,
     )
-    return Fused(points.reshape(*grid, 3), covariance, float(gains.mean()), int(np.count_nonzero(near)))
+    return Fused(points.reshape(*grid, 3), covariance, float(gains.sum() / len(points)), int(np.count_nonzero(near)))

@@ -14,7 +14,7 @@ from bsmap_cli.merge.facing import visible_normals
 from bsmap_cli.merge.patch import Landing, Patch, Window, land, width
 from bsmap_cli.model import Array
 
-CELLS = 48
+CELLS = 32
 """Most cells along either direction when an overlap is sampled."""
 PRICE_KEPT, PRICE_REPLACED = 1.0, 20.0
 """Price of a cell outside the overlap, in cells inside: in the patch whose shape is kept, where such a cell stays as it

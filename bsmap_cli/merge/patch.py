@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bsmap_cli.core.bspline import evaluate_grid, restrict
-from bsmap_cli.core.projection import Samples, project, sample_surface
+from bsmap_cli.core.projection import OFFSET, Samples, project, sample_surface
 from bsmap_cli.merge.covariance import carry
 from bsmap_cli.merge.facing import Facing, visible_normals, visible_side
 from bsmap_cli.model import Array, BSplineSurface
@@ -103,7 +103,8 @@ def land(points: Array, normals: Array, target: Patch, distance: float) -> Landi
     on, same = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
     grid = target.samples.fine
     gap, nearest = grid.tree.query(points, distance_upper_bound=distance + float(grid.reach.max()))
-    close = np.flatnonzero(np.asarray(gap) <= distance + np.append(grid.reach, 0.0)[nearest])
+    # A foot lies beside the sample that is nearest to it, at most by a share of the cell.
+    close = np.flatnonzero(np.asarray(gap) <= np.hypot(distance, OFFSET * np.append(grid.reach, 0.0)[nearest]))
     if len(close):
         found = project(target.surface, points[close], target.samples)
         u[close], v[close], foot[close] = found.u, found.v, found.foot

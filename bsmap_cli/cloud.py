@@ -99,10 +99,10 @@ def _in_order(trajectory: Trajectory) -> Trajectory:
 
 
 def _covered(scans: LaserScans, trajectory: Trajectory) -> NDArray[np.bool_]:
-    """(n,) whether the trajectory reaches over the whole of each scan, give or take one step of it."""
+    """(n,) whether the trajectory reaches over the whole of each scan, from its first beam to its last."""
     first, last = trajectory.time_ns[[0, -1]]
-    slack = int(np.median(np.diff(trajectory.time_ns))) if len(trajectory.time_ns) > 1 else 0
-    return (scans.time_ns >= first - slack) & (scans.time_ns <= last + slack)
+    takes = int(np.rint((scans.ranges.shape[1] - 1) * scans.time_increment * 1e9))
+    return (scans.time_ns >= first) & (scans.time_ns + takes <= last)
 
 
 def _interpolate_covariances(trajectory: Trajectory, at_ns: IntArray) -> Array:

@@ -22,6 +22,9 @@ Three times that where data are plenty, degree 3; beyond, it grows with the degr
 END_SHARE = 0.25
 """Of a span, that a new knot keeps away from either end."""
 
+NARROW = 1e-9
+"""Spans where the data of all rows leave less room than this get no more knots."""
+
 
 class Rows(NamedTuple):
     """Data of the curves, row after row, ascending in u within each row.
@@ -116,7 +119,7 @@ def refine_curves(rows: Rows, degree: int, bound: float, knots_per_pass: int) ->
         lowest, highest = _admissible_interval(rows, fit.knots)
         margin = END_SHARE * (highest - lowest)
         places = np.clip(rows.u, lowest + margin, highest - margin)
-        candidates = np.flatnonzero((excess > bound) & (highest > lowest) & ~barred)
+        candidates = np.flatnonzero((excess > bound) & (highest - lowest > NARROW) & ~barred)
         worst_first = candidates[np.argsort(-excess[candidates], kind="stable")]
         chosen = _choose(rows, fit.knots, degree, places, worst_first, knots_per_pass)
         if not chosen:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import operator
 import sys
 import time
 import types
@@ -32,7 +33,7 @@ def input_argument(name: str, many: bool = False) -> Callable[[Command], Command
 
 
 def parameters(*classes: type) -> Callable[[Command], Command]:
-    """Give a command an option for each field; it gets one instance a class, named like it (SlamParams: slam_params)."""
+    """Give a command an option for each field; it gets one instance a class, named like it: slam_params."""
 
     def decorate(command: Command) -> Command:
         @wraps(command)
@@ -77,7 +78,13 @@ def _option(owner: type, f: "dataclasses.Field[Any]", hint: Any) -> Callable[[Co
         if not in_degrees or value is None:
             return value
         # The default is handed on untouched: degrees and back would change its last bit.
-        return default if value == shown else math.radians(value)
+        radians = default if value == shown else math.radians(value)
+        for limit, beyond in ((meta["min"], operator.lt), (meta["max"], operator.gt)):
+            if limit is not None and beyond(radians, limit):
+                raise click.BadParameter(
+                    f"{value:g} is beyond the limit of {math.degrees(limit):g} degrees", ctx, option
+                )
+        return radians
 
     key, has_default = _key(owner, f), default is not None
     return click.option(flag, key, type=kind, default=shown, show_default=has_default, help=help, callback=convert)

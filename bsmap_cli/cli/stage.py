@@ -3,12 +3,12 @@
 import dataclasses
 import os
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from bsmap_cli.cli.options import existing, progress, say
-from bsmap_cli.errors import ParameterError
+from bsmap_cli.errors import CannotWriteError, ParameterError
 from bsmap_cli.track import Track
 
 Writer = Callable[[Path, Any], object]
@@ -35,11 +35,12 @@ def run_stage(
 
     for path in inputs:
         existing(path)
-    _refuse_overwriting(inputs, outputs)
+    _check_outputs(inputs, outputs)
     provenance = artifact.make_provenance(stage, artifact.plain_parameters(*params), inputs)
     if not force and all(artifact.is_up_to_date(path, provenance.fingerprint) for path in outputs):
         for path in outputs:
-            os.utime(path)
+            with suppress(PermissionError):  # somebody else's file is up to date all the same
+                os.utime(path)
         say(f"{outputs[0]}: up to date")
         return
     result = compute(progress())
@@ -52,10 +53,17 @@ def run_stage(
     say(f"{', '.join(map(str, outputs))}: {figures}")
 
 
-def _refuse_overwriting(inputs: Sequence[Path], outputs: Sequence[Path]) -> None:
-    for path in outputs:
+def _check_outputs(inputs: Sequence[Path], outputs: Sequence[Path]) -> None:
+    """Before any work: outputs must not be inputs or one file, and their folders must be there."""
+    for k, path in enumerate(outputs):
         if any(path.resolve() == other.resolve() for other in inputs):
             raise ParameterError(f"{path}: is the input; name another output with -o")
+        if any(path.resolve() == other.resolve() for other in outputs[:k]):
+            raise ParameterError(f"{path}: is the name of two outputs; name another one with -o")
+        if not path.parent.is_dir():
+            raise CannotWriteError(f"{path}: there is no folder {path.parent}")
+        if path.is_dir():
+            raise CannotWriteError(f"{path}: is a folder; name another output")
 
 
 def _short(value: Any) -> str:

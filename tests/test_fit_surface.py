@@ -199,3 +199,24 @@ def test_covariance_is_exact_in_full_for_equal_noise_and_parameters():
     across = np.einsum("ni,ij,nj->n", rows_v, np.linalg.inv(M.T @ M), rows_v)
     wanted = SIGMA**2 * (along * across)[:, None, None] * np.eye(3)
     np.testing.assert_allclose(sensor_covariance(as_surface(fit), u, v), wanted, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3, 5])
+@pytest.mark.parametrize("knots_per_pass", [1, 7])
+@pytest.mark.parametrize("seed", range(4))
+def test_any_rows_are_refined_to_an_end(degree, knots_per_pass, seed):
+    """Noise, jumps, gaps, coincident points, rows of unequal length: no crash, no wild curve."""
+    rng = np.random.default_rng(seed)
+    lengths = rng.integers(3 * degree + 3, 60, 5)
+    row = np.repeat(np.arange(5), lengths)
+    points = np.cumsum(rng.standard_normal((lengths.sum(), 3)) * 0.05, axis=0)
+    points[rng.random(len(row)) < 0.1] += rng.choice([-2.0, 2.0])
+    same = np.flatnonzero(rng.random(len(row) - 1) < 0.1)
+    points[same + 1] = points[same]
+    rows = Rows(centripetal(points, row), row, points[:, None], np.zeros((len(row), 1)))
+    fit = refine_curves(rows, degree, 0.01, knots_per_pass)
+    assert np.all(np.diff(fit.knots) >= 0)
+    assert np.isfinite(fit.errors).all()
+    size = np.ptp(points, axis=0).max()
+    assert np.abs(fit.control_points - points.mean(axis=0)).max() < 30 * size
+    assert fit.errors.max() < fit_curves(rows, open_knots(degree), degree).errors.max() * 1.5

@@ -150,8 +150,14 @@ def _try(rows: Rows, knots: Array, degree: int, new: Array) -> CurveFit | None:
     return fit if variances.max() <= LARGEST_VARIANCE * 3.0 ** max(0, degree - 3) else None
 
 
+def _spans(rows: Rows, knots: Array) -> NDArray[np.intp]:
+    """(n,) number of the span that holds each point; the last one holds its right end, too."""
+    breaks = np.unique(knots)
+    return np.minimum(np.searchsorted(breaks, rows.u, side="right"), len(breaks) - 1) - 1
+
+
 def _same_span(rows: Rows, knots: Array, index: int) -> NDArray[np.bool_]:
-    span = np.searchsorted(knots, rows.u, side="right")
+    span = _spans(rows, knots)
     return span == span[index]
 
 
@@ -163,8 +169,7 @@ def _choose(
     rows: Rows, knots: Array, degree: int, places: Array, candidates: NDArray[np.intp], count: int
 ) -> list[int]:
     """Up to `count` of the candidates, worst first, one a span, that may have knots at their places (n,)."""
-    breaks = np.unique(knots)
-    span = np.searchsorted(breaks, rows.u, side="right")
+    span = _spans(rows, knots)
     chosen: list[int] = []
     seen: set[int] = set()
     for index in candidates.tolist():
@@ -180,9 +185,8 @@ def _choose(
 
 def _admissible_interval(rows: Rows, knots: Array) -> tuple[Array, Array]:
     """For the span of each point, (n,) and (n,): a knot, lowest < knot <= highest, leaves every row data both sides."""
-    breaks = np.unique(knots)
-    spans = len(breaks) - 1
-    span = np.clip(np.searchsorted(breaks, rows.u, side="right") - 1, 0, spans - 1)
+    span = _spans(rows, knots)
+    spans = int(span.max()) + 1
     # Rows ascend in u, and every row has data in every span: the first of each (row, span) are in order.
     first = np.flatnonzero(np.diff(rows.row * spans + span, prepend=-1))
     last = np.append(first[1:], len(span)) - 1

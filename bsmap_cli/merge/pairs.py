@@ -7,7 +7,7 @@ from bsmap_cli.merge.patch import Patch, Window, width
 from bsmap_cli.model import Decision
 from bsmap_cli.params import MergeParams
 
-LEAST_SIDE = 4.0
+LEAST_SIDE = 6.0
 """Shortest side of a rectangle that is merged, in units of MergeParams.distance."""
 LEAST_SHARE = 0.25
 """Least share of an overlap that its rectangle must hold; below, the overlap has no sensible rectangle."""

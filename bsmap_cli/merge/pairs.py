@@ -46,9 +46,15 @@ def find_overlap(first: Patch, second: Patch, params: MergeParams) -> Overlap | 
     if found.first is None or found.second is None:
         figures = {"opposite": float(found.opposite)}
         return refused(a.name, b.name, "they face opposite ways", figures) if found.opposite else None
+    widths = [_narrower_side(first, found.first), _narrower_side(second, found.second)]
+    if max(widths) < params.distance:
+        return None  # neighbours
     inside = [
-        rectangle(patch, window, other, params.distance, PRICE_REPLACED)
-        for patch, window, other in ((first, found.first, second), (second, found.second, first))
+        rectangle(patch, window, other, params.distance, PRICE_REPLACED) if narrow >= least else None
+        for patch, window, other, narrow in (
+            (first, found.first, second, widths[0]),
+            (second, found.second, first, widths[1]),
+        )
     ]
     sides = [
         Side(patch, window, found_inside if _sensible(patch, found_inside, least) else None)
@@ -58,17 +64,20 @@ def find_overlap(first: Patch, second: Patch, params: MergeParams) -> Overlap | 
     if area > 0.0:
         return Overlap(sides[0], sides[1], area)
     largest = max((candidate for candidate in inside if candidate), key=lambda r: r.area, default=None)
-    if largest is None or largest.area < params.distance**2:
-        return None  # neighbours
-    figures = {"area": largest.area, "share": largest.share}
+    figures = {"area": largest.area, "share": largest.share} if largest else {"width": max(widths)}
     return refused(a.name, b.name, "no sensible rectangle holds their overlap", figures)
 
 
 def _sensible(patch: Patch, inside: Rectangle | None, least: float) -> bool:
     if inside is None or inside.share < LEAST_SHARE:
         return False
-    u0, u1, v0, v1 = inside.window
-    return min(width(patch, 0, u0, u1), width(patch, 1, v0, v1)) >= least
+    return _narrower_side(patch, inside.window) >= least
+
+
+def _narrower_side(patch: Patch, window: Window) -> float:
+    """Shorter side of a window in metres."""
+    u0, u1, v0, v1 = window
+    return min(width(patch, 0, u0, u1), width(patch, 1, v0, v1))
 
 
 def refused(first: str, second: str, reason: str, figures: dict[str, float]) -> Decision:

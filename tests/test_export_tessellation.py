@@ -11,6 +11,7 @@ from bsmap_cli.export.tessellation import (
     grid_parameters,
     second_derivative_bounds,
     tessellate,
+    triangle_distance,
 )
 from bsmap_cli.model import BSplineSurface, PosePart, Residuals, SurfaceCovariance, SurfaceMap
 
@@ -37,20 +38,14 @@ def flat_surface(corners, **kwargs):
     return make_surface(np.reshape(corners, (2, 2, 3)), 1, 1, **kwargs)
 
 
-def interpolation_error(surface, u, v, n=20000):
-    """Largest distance of surface and mesh at the same random parameters (slow twin of the bound)."""
+def dense_distance(surface, u, v, n=20000):
+    """Largest distance of random points of the surface to the two triangles of their cell."""
     at = np.random.default_rng(1).uniform(size=(2, n))
-    i, j = (
-        np.clip(np.searchsorted(grid, x, "right") - 1, 0, len(grid) - 2) for grid, x in zip((u, v), at, strict=True)
-    )
-    s, t = (at[0] - u[i]) / (u[i + 1] - u[i]), (at[1] - v[j]) / (v[j + 1] - v[j])
+    i, j = (np.searchsorted(grid, x, "right") - 1 for grid, x in zip((u, v), at, strict=True))
     points = evaluate_grid(surface, u, v)
     p00, p10, p01, p11 = points[i, j], points[i + 1, j], points[i, j + 1], points[i + 1, j + 1]
-    s, t = s[:, None], t[:, None]
-    lower = p00 + s * (p10 - p00) + t * (p11 - p10)
-    upper = p00 + t * (p01 - p00) + s * (p11 - p01)
-    mesh = np.where(s >= t, lower, upper)
-    return np.linalg.norm(mesh - evaluate_surface(surface, *at), axis=1).max()
+    there = evaluate_surface(surface, *at)
+    return np.minimum(triangle_distance(there, p00, p10, p11), triangle_distance(there, p00, p11, p01)).max()
 
 
 @pytest.mark.parametrize(("degree_u", "degree_v"), [(1, 1), (1, 3), (2, 2), (3, 3), (4, 2)])
@@ -58,13 +53,34 @@ def interpolation_error(surface, u, v, n=20000):
 def test_mesh_keeps_its_tolerance(degree_u, degree_v, tolerance):
     surface = rough_surface(degree_u, degree_v)
     u, v = grid_parameters(surface, tolerance)
-    assert interpolation_error(surface, u, v) <= tolerance
+    assert dense_distance(surface, u, v) <= tolerance
 
 
 def test_tolerance_is_not_kept_by_wasting_points():
     surface = rough_surface(3, 3)
     u, v = grid_parameters(surface, 0.005)
-    assert interpolation_error(surface, u, v) > 0.005 / 4
+    assert dense_distance(surface, u, v) > 0.005 / 2
+
+
+def test_triangle_distance_agrees_with_dense_samples_of_the_triangle():
+    rng = np.random.default_rng(3)
+    weights = rng.dirichlet(np.ones(3) / 2, size=20000)
+    for p, a, b, c in rng.normal(size=(20, 4, 3)):
+        nearest = np.linalg.norm(weights @ np.stack([a, b, c]) - p, axis=1).min()
+        assert triangle_distance(p, a, b, c) <= nearest
+        assert triangle_distance(p, a, b, c) == pytest.approx(nearest, abs=0.02)
+
+
+def test_distance_to_a_triangle_without_area_is_that_to_its_longest_side():
+    a, b, c = np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]])
+    assert triangle_distance(np.array([2.0, 1, 0]), a, b, c) == pytest.approx(1.0)
+    assert triangle_distance(np.array([4.0, 0, 0]), a, b, c) == pytest.approx(1.0)
+
+
+def test_flat_surface_is_not_divided_for_what_slides_inside_it():
+    """Its parameters run unevenly: second derivatives, but no distance."""
+    mesh = tessellate(make_surface([[[x, y, 0.0] for y in (0, 0.1, 0.5, 4)] for x in (0, 3, 3.5, 4)]), 0.001)
+    assert len(mesh.triangles) == 2
 
 
 def test_grid_holds_all_knots_so_that_creases_stay_sharp():

@@ -1,4 +1,4 @@
-"""Triangles of a B-spline surface, fine where it curves, within a tolerance that holds for certain.
+"""Triangles of a B-spline surface, fine where it curves, within a tolerance.
 
 The surface is sampled on a grid of parameters that holds all its knots, each span divided into equal steps. Over a
 triangle with legs a and b along u and v its distance to the surface is at most (Filip, Magedson and Markot 1986,
@@ -6,7 +6,8 @@ triangle with legs a and b along u and v its distance to the surface is at most 
 
     1/8 (a^2 max|S_uu| + 2 a b max|S_uv| + b^2 max|S_vv|),
 
-and the control points of S_uu, S_uv, S_vv bound these (convex hull). Neighbouring surfaces are divided each on its own:
+and the control points of S_uu, S_uv, S_vv bound these (convex hull). The bound tells where to divide; what distance is
+left is measured. Neighbouring surfaces are divided each on its own:
 where they share an edge, the two rows of triangles meet within the tolerance, not point by point.
 """
 
@@ -20,6 +21,9 @@ from bsmap_cli.model import Array, BSplineSurface, IntArray
 
 MOST_POINTS = 10_000_000
 """Points of one surface; beyond it a tolerance is refused, for no viewer shows the mesh and memory runs out."""
+
+MARGIN = 1.25
+"""On measured distances, for what lies between the points of measurement."""
 
 SLIVER = 1e-9
 """Metres; a triangle less high than this is dropped (where the edge of a surface shrinks to a point)."""
@@ -41,7 +45,7 @@ class Bounds(NamedTuple):
 
 
 def tessellate(surface: BSplineSurface, tolerance: float) -> Mesh:
-    """Mesh no farther than `tolerance` metres from the surface, nor the surface from it; front is S_u x S_v.
+    """Mesh within `tolerance` metres of the surface, as measured by `mesh_distance`; its front is S_u x S_v.
 
     Raises
     ------
@@ -54,26 +58,107 @@ def tessellate(surface: BSplineSurface, tolerance: float) -> Mesh:
 
 
 def grid_parameters(surface: BSplineSurface, tolerance: float) -> tuple[Array, Array]:
-    """Ascending parameters along u and v, all knots among them, that keep the bound below the tolerance."""
-    edges_u, edges_v = np.unique(surface.knots_u), np.unique(surface.knots_v)
+    """Ascending parameters along u and v, all knots among them, of a grid whose mesh keeps the tolerance.
+
+    The bound also counts what slides along the surface, so that it asks for some three times too many triangles. How
+    much of it is distance is measured in each knot span on the grid that the bound gives; both shrink with the square
+    of the step, so the share found holds for a coarser grid, too. That grid is measured in turn, and where it fails the
+    share rises; at 1 the bound holds for certain, so this ends.
+    """
     bounds = second_derivative_bounds(surface)
-    steps_u, steps_v = np.ones(len(edges_u) - 1, dtype=int), np.ones(len(edges_v) - 1, dtype=int)
+    share = _measure(surface, bounds, np.ones_like(bounds.uu), tolerance).share
     while True:
-        a, b = (np.diff(edges_u) / steps_u)[:, None], np.diff(edges_v) / steps_v
-        along_u, twist, along_v = a**2 * bounds.uu, a * b * bounds.uv, b**2 * bounds.vv
-        error = (along_u + 2.0 * twist + along_v) / 8.0
+        grid = _measure(surface, bounds, share, tolerance)
+        higher = np.where(grid.distance > tolerance, np.maximum(share, grid.share), share)
+        if np.array_equal(higher, share):
+            return grid.u, grid.v
+        share = higher
+
+
+class _Measured(NamedTuple):
+    """Grid; in each knot span the largest distance of the mesh, and its share of the bound (with MARGIN, up to 1)."""
+
+    u: Array
+    v: Array
+    distance: Array
+    share: Array
+
+
+def _measure(surface: BSplineSurface, bounds: Bounds, share: Array, tolerance: float) -> _Measured:
+    """Grid by `share` of the bounds, and what distance its mesh has."""
+    edges_u, edges_v = np.unique(surface.knots_u), np.unique(surface.knots_v)
+    steps_u, steps_v = _fewest_steps(surface.name, edges_u, edges_v, Bounds(*(share * b for b in bounds)), tolerance)
+    u, v = _divide(edges_u, steps_u), _divide(edges_v, steps_v)
+    distance = _largest_in_spans(mesh_distance(surface, u, v), steps_u, steps_v)
+    bound = _bound_error(bounds, edges_u, edges_v, steps_u, steps_v)
+    ratio = np.divide(MARGIN * distance, bound, out=np.zeros_like(bound), where=bound > 0.0)
+    return _Measured(u, v, distance, np.minimum(ratio, 1.0))
+
+
+def _bound_error(bounds: Bounds, edges_u: Array, edges_v: Array, steps_u: IntArray, steps_v: IntArray) -> Array:
+    a, b = (np.diff(edges_u) / steps_u)[:, None], np.diff(edges_v) / steps_v
+    return np.asarray((a**2 * bounds.uu + 2.0 * a * b * bounds.uv + b**2 * bounds.vv) / 8.0)
+
+
+def _fewest_steps(
+    name: str, edges_u: Array, edges_v: Array, bounds: Bounds, tolerance: float
+) -> tuple[IntArray, IntArray]:
+    """Steps in each span of u and of v that bring the bound below the tolerance, found one by one."""
+    steps_u, steps_v = np.ones(len(edges_u) - 1, dtype=np.int64), np.ones(len(edges_v) - 1, dtype=np.int64)
+    while True:
+        error = _bound_error(bounds, edges_u, edges_v, steps_u, steps_v)
         i, j = np.unravel_index(np.argmax(error), error.shape)
         if error[i, j] <= tolerance:
-            return _divide(edges_u, steps_u), _divide(edges_v, steps_v)
+            return steps_u, steps_v
         if (steps_u.sum() + 1) * (steps_v.sum() + 1) > MOST_POINTS:
             raise ParameterError(
-                f"a tolerance of {tolerance} m needs more than {MOST_POINTS} points for surface {surface.name}; "
+                f"a tolerance of {tolerance} m needs more than {MOST_POINTS} points for surface {name}; "
                 "choose a larger one"
             )
-        if along_u[i, j] >= along_v[i, j]:
+        a, b = (edges_u[i + 1] - edges_u[i]) / steps_u[i], (edges_v[j + 1] - edges_v[j]) / steps_v[j]
+        if a**2 * bounds.uu[i, j] >= b**2 * bounds.vv[i, j]:
             steps_u[i] += 1 + steps_u[i] // 8
         else:
             steps_v[j] += 1 + steps_v[j] // 8
+
+
+def mesh_distance(surface: Surface, u: Array, v: Array) -> Array:
+    """Distance (n - 1, m - 1) of each grid cell's middle, and of the middles of its sides, to its two triangles."""
+    points = evaluate_grid(surface, _with_middles(u), _with_middles(v))
+    low, middle, high = slice(None, -1, 2), slice(1, None, 2), slice(2, None, 2)
+    lower = points[low, low], points[high, low], points[high, high]
+    upper = points[low, low], points[high, high], points[low, high]
+    centre = points[middle, middle]
+    found = [np.minimum(triangle_distance(centre, *lower), triangle_distance(centre, *upper))]
+    found += [triangle_distance(side, *lower) for side in (points[middle, low], points[high, middle])]
+    found += [triangle_distance(side, *upper) for side in (points[middle, high], points[low, middle])]
+    return np.asarray(np.max(found, axis=0))
+
+
+def triangle_distance(p: Array, a: Array, b: Array, c: Array) -> Array:
+    """Distance (...) of points p (..., 3) to triangles a b c, each (..., 3): to the plane above it, else to an edge."""
+    normal = np.cross(b - a, c - a)
+    area = np.linalg.norm(normal, axis=-1)
+    edges = [(a, b), (b, c), (c, a)]
+    inside = np.all([np.sum(np.cross(e - s, p - s) * normal, axis=-1) >= 0.0 for s, e in edges], axis=0) & (area > 0.0)
+    height = np.abs(np.sum((p - a) * normal, axis=-1)) / np.where(area > 0.0, area, 1.0)
+    return np.where(inside, height, np.min([_segment_distance(p, s, e) for s, e in edges], axis=0))
+
+
+def _segment_distance(p: Array, start: Array, end: Array) -> Array:
+    along, length = end - start, np.sum((end - start) ** 2, axis=-1)
+    t = np.clip(np.sum((p - start) * along, axis=-1) / np.where(length > 0.0, length, 1.0), 0.0, 1.0)
+    return np.asarray(np.linalg.norm(p - start - t[..., None] * along, axis=-1))
+
+
+def _with_middles(grid: Array) -> Array:
+    return np.insert(grid, np.arange(1, len(grid)), (grid[1:] + grid[:-1]) / 2.0)
+
+
+def _largest_in_spans(cells: Array, steps_u: IntArray, steps_v: IntArray) -> Array:
+    """Largest value of the cells in each knot span."""
+    starts_u, starts_v = np.cumsum(steps_u) - steps_u, np.cumsum(steps_v) - steps_v
+    return np.asarray(np.maximum.reduceat(np.maximum.reduceat(cells, starts_u, axis=0), starts_v, axis=1))
 
 
 def second_derivative_bounds(surface: Surface) -> Bounds:

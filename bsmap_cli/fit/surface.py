@@ -98,7 +98,7 @@ def _excess(rows: Rows, fit: CurveFit) -> float:
 def _propagate_along(lines: ScanLines, u: Array, along: CurveFit, degree: int) -> tuple[Array, Array]:
     """C_P = A C_Q A' along the scan lines, Eq. (32): blocks (lines, nu, 6), mean correlation (nu, nu).
 
-    A = (N'N)^-1 N', and A A' = (N'N)^-1 gives the correlation under equal noise.
+    A = (N'N)^-1 N'; under equal noise A A' = (N'N)^-1, which gives the correlation.
     """
     n_control = along.control_points.shape[1]
     blocks = np.empty((lines.n_lines, n_control, 6))
@@ -106,9 +106,9 @@ def _propagate_along(lines: ScanLines, u: Array, along: CurveFit, degree: int) -
     starts = np.searchsorted(lines.line, np.arange(lines.n_lines + 1))
     for k, (start, stop) in enumerate(itertools.pairwise(starts)):
         N = design_matrix(along.knots, degree, u[start:stop])
-        A = leastsquares.solve(along.factor[:, k * n_control : (k + 1) * n_control], N.T)
-        blocks[k] = A**2 @ lines.covariances[start:stop]
-        correlation += _correlation(A @ A.T)
+        factor = along.factor[:, k * n_control : (k + 1) * n_control]
+        blocks[k] = leastsquares.solve(factor, N.T) ** 2 @ lines.covariances[start:stop]
+        correlation += _correlation(leastsquares.solve(factor, np.eye(n_control)))
     return blocks, correlation / lines.n_lines
 
 

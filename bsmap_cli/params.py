@@ -34,6 +34,8 @@ class Checked:
             low, high, choices = meta["min"], meta["max"], meta["choices"]
             if choices and value not in choices:
                 raise ParameterError(f"{f.name}: {value!r} is not one of {', '.join(choices)}")
+            if isinstance(value, float) and math.isnan(value):
+                raise ParameterError(f"{f.name}: nan is not a value")
             if value is not None and ((low is not None and value < low) or (high is not None and value > high)):
                 raise ParameterError(f"{f.name}: {value} is outside [{low}, {high}]")
 

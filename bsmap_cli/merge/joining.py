@@ -24,8 +24,6 @@ GROWTH = 1.15
 """Times the control points of both patches that their pieces may have. Every cut adds some: without a limit the map of
 a room falls into hundreds of pieces with three times the control points, with 1.0 most overlaps stay doubled."""
 
-TOO_MANY = "the pieces would need too many control points"
-
 Naming = Callable[[str], str]
 """Gives a new name to a piece of the surface of that name."""
 
@@ -50,45 +48,66 @@ class Merging(NamedTuple):
     decision: Decision
 
 
+class _Refusal(Exception):
+    """Why a pair stays apart."""
+
+
 def merge_pair(overlap: Overlap, params: MergeParams, naming: Naming) -> Merging:
     """Divide two patches at their overlap, fuse the pair of pieces that show it, and fit one surface to them."""
-    first, second = overlap.first, overlap.second
-    names = first.patch.surface.name, second.patch.surface.name
+    first, second = overlap.first.patch.surface.name, overlap.second.patch.surface.name
     figures = {"area": overlap.area}
-    plans = [_plan(a, b, params.distance) for a, b in ((first, second), (second, first)) if b.inside]
-    plan = min((plan for plan in plans if plan), key=lambda plan: plan.rests, default=None)
-    if plan is None:
-        return Merging(None, refused(*names, "no sensible rectangle holds their overlap", figures))
-    before = sum(_controls(patch, WHOLE) for patch in (plan.kept, plan.replaced))
-    figures["control_points_before"] = float(before)
-    figures["control_points_after"] = float(plan.rests)
-    if plan.rests > GROWTH * before:
-        return Merging(None, refused(*names, TOO_MANY, figures))
-    kept, replaced = _part(plan.kept, plan.kept_window), _part(plan.replaced, plan.replaced_window)
-    if not _middle_hits(kept, replaced, params.distance):
-        return Merging(None, refused(*names, "the middle of neither piece lands on the other", figures))
-    pairing = pair_samples(kept, replaced, params.distance)
-    figures["samples"] = float(np.count_nonzero(pairing.hit))
-    if len(pairing.offsets) < LEAST_SAMPLES:
-        return Merging(None, refused(*names, "too few samples of one land on the other", figures))
-    agreed = agreement(kept, replaced, pairing, params)
-    figures |= _figures(agreed, pairing)
-    if not agreed.passed:
-        return Merging(None, refused(*names, "they differ by more than their covariances allow", figures))
-    fused = fuse(kept, replaced, pairing, params)
-    if 2 * fused.moved < len(pairing.offsets):
-        return Merging(None, refused(*names, "most samples differ by more than their covariances allow", figures))
-    fitted = refit(kept.surface, pairing, fused, params)
-    figures |= {"moved": float(fused.moved), "gain": fused.gain, "refit_95": fitted.residuals.percentile_95}
-    if fitted.residuals.percentile_95 > SPOILT * max(params.bound_u, params.bound_v):
-        return Merging(None, refused(*names, "the merged patch does not follow its samples", figures))
-    figures["control_points_after"] = float(plan.rests + np.prod(fitted.spline.control_points.shape[:2]))
-    if figures["control_points_after"] > GROWTH * before:
-        return Merging(None, refused(*names, TOO_MANY, figures))
+    try:
+        plan = _best_plan(overlap, params, figures)
+        kept, replaced = _part(plan.kept, plan.kept_window), _part(plan.replaced, plan.replaced_window)
+        fused, fitted = _fuse_pieces(kept, replaced, params, figures)
+        _limit_growth(plan, fitted.spline.control_points.shape[0] * fitted.spline.control_points.shape[1], figures)
+    except _Refusal as refusal:
+        return Merging(None, refused(first, second, str(refusal), figures))
     merged = _merged_patch(kept, replaced, fused, fitted, naming)
     rests = [*_rests(plan.kept, plan.kept_window, naming), *_rests(plan.replaced, plan.replaced_window, naming)]
     reason = f"they agree; {merged.surface.name} replaces their overlap"
-    return Merging([merged, *rests], Decision(*names, "merged", reason, figures))
+    return Merging([merged, *rests], Decision(first, second, "merged", reason, figures))
+
+
+def _best_plan(overlap: Overlap, params: MergeParams, figures: dict[str, float]) -> Plan:
+    """Of both ways to divide a pair, the one that leaves the fewest control points around the overlap."""
+    sides = ((overlap.first, overlap.second), (overlap.second, overlap.first))
+    plans = [_plan(kept, replaced, params.distance) for kept, replaced in sides if replaced.inside]
+    plan = min((plan for plan in plans if plan), key=lambda plan: plan.rests, default=None)
+    if plan is None:
+        raise _Refusal("no sensible rectangle holds their overlap")
+    _limit_growth(plan, 0, figures)
+    return plan
+
+
+def _limit_growth(plan: Plan, merged: int, figures: dict[str, float]) -> None:
+    """Refuse a merging whose pieces, with the merged one's control points, are too many."""
+    before, after = _controls(plan.kept, WHOLE) + _controls(plan.replaced, WHOLE), plan.rests + merged
+    figures |= {"control_points_before": float(before), "control_points_after": float(after)}
+    if after > GROWTH * before:
+        raise _Refusal("the pieces would need too many control points")
+
+
+def _fuse_pieces(kept: Patch, replaced: Patch, params: MergeParams, figures: dict[str, float]) -> tuple[Fused, Refit]:
+    """Test whether two pieces pair and agree, fuse their samples, and fit them."""
+    if not _middle_hits(kept, replaced, params.distance):
+        raise _Refusal("the middle of neither piece lands on the other")
+    pairing = pair_samples(kept, replaced, params.distance)
+    figures["samples"] = float(np.count_nonzero(pairing.hit))
+    if len(pairing.offsets) < LEAST_SAMPLES:
+        raise _Refusal("too few samples of one land on the other")
+    agreed = agreement(kept, replaced, pairing, params)
+    figures |= _figures(agreed, pairing)
+    if not agreed.passed:
+        raise _Refusal("they differ by more than their covariances allow")
+    fused = fuse(kept, replaced, pairing, params)
+    if 2 * fused.moved < len(pairing.offsets):
+        raise _Refusal("most samples differ by more than their covariances allow")
+    fitted = refit(kept.surface, pairing, fused, params)
+    figures |= {"moved": float(fused.moved), "gain": fused.gain, "refit_95": fitted.residuals.percentile_95}
+    if fitted.residuals.percentile_95 > SPOILT * max(params.bound_u, params.bound_v):
+        raise _Refusal("the merged patch does not follow its samples")
+    return fused, fitted
 
 
 def _plan(kept: Side, replaced: Side, distance: float) -> Plan | None:

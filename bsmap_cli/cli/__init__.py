@@ -6,6 +6,7 @@ import signal
 import sys
 
 import click
+from click.utils import PacifyFlushWrapper
 
 from bsmap_cli import __version__
 from bsmap_cli.cli.cloud import cloud
@@ -71,15 +72,24 @@ def _guarded() -> int:
     except BsmapError as error:
         return _fail(str(error), error.exit_code)
     except BrokenPipeError:
-        # The reader of our output has gone (bsmap info | head): nothing is wrong.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+        return _reader_gone()
+    except SystemExit:
+        # Click makes an exit of a broken pipe.
+        if isinstance(sys.stdout, PacifyFlushWrapper):
+            return _reader_gone()
+        raise
     except MemoryError:
         return _fail("out of memory: use a machine with more, or a shorter log", 1)
     except Exception as error:
         if os.environ.get("BSMAP_DEBUG"):
             raise
         return _fail(f"internal error, please report it: {type(error).__name__}: {error} (BSMAP_DEBUG=1 shows more)", 1)
+
+
+def _reader_gone() -> int:
+    """Nothing is wrong when the reader of our output has gone (bsmap info | head)."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 0
 
 
 def _fail(message: str, code: int) -> int:

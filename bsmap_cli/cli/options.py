@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import operator
+import stat
 import sys
 import time
 import types
@@ -92,10 +93,14 @@ def _option(owner: type, f: "dataclasses.Field[Any]", hint: Any) -> Callable[[Co
 
 def existing(path: Path) -> Path:
     """The path, if a file is there; MissingInputError names it otherwise."""
-    if path.is_dir():
+    try:
+        is_folder = stat.S_ISDIR(path.stat().st_mode)
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise MissingInputError(f"{path}: no such file") from error
+    except OSError as error:  # no permission, name too long, broken medium
+        raise MissingInputError(f"{path}: {error.strerror or error}") from error
+    if is_folder:
         raise MissingInputError(f"{path}: is a folder, a file is wanted")
-    if not path.exists():
-        raise MissingInputError(f"{path}: no such file")
     return path
 
 

@@ -1,0 +1,45 @@
+"""bsmap merge by its entry point."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+from commands import assert_caches, assert_refused, assert_usual_refusals, bsmap, process
+
+from bsmap_cli.io.artifact import read_provenance
+from bsmap_cli.io.surfaces_json import read_surfaces
+
+
+@pytest.fixture
+def surfaces(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copy(made / "log.surfaces.json", tmp_path))
+
+
+def test_map_lies_beside_the_surfaces_and_tells_its_decisions(surfaces):
+    done = process("merge", surfaces)
+    assert done.code == 0
+    assert done.out == ""
+    output = surfaces.with_name("log.map.json")
+    merged = read_surfaces(output)
+    assert {decision.outcome for decision in merged.decisions} <= {"merged", "refused"}
+    assert read_provenance(output).figures["merged"] == sum(d.outcome == "merged" for d in merged.decisions)
+    assert f"{output}: surfaces {len(merged.surfaces)}" in done.err
+
+
+def test_it_is_made_once_and_again_when_something_changed(surfaces):
+    assert_caches(["merge", surfaces], surfaces.with_name("log.map.json"), ["--distance", "0.05"])
+
+
+def test_several_inputs_make_one_map_named_by_the_first(surfaces, tmp_path):
+    other = Path(shutil.copy(surfaces, tmp_path / "other.surfaces.json"))
+    done = bsmap("merge", surfaces, other)
+    assert done.code == 0, done
+    names = [name for name, _ in read_provenance(tmp_path / "log.map.json").inputs]
+    assert names == ["log.surfaces.json", "other.surfaces.json"]
+    assert not (tmp_path / "other.map.json").exists()
+
+
+def test_what_it_refuses(surfaces, tmp_path):
+    assert_usual_refusals("merge", surfaces, tmp_path)
+    assert_refused(bsmap("merge", surfaces, tmp_path / "gone.json"), 66, "gone.json: no such file")
+    assert_refused(bsmap("merge", surfaces, "--gate", "0.1"), 2, "gate: 0.1 is outside")

@@ -77,8 +77,14 @@ class SlamParams(Checked):
     overlap_margin: float = parameter(0.3, "Segments of one wall may lie this far apart along it.", "m", 0.0)
     tentative_hits: int = parameter(3, "Scans that must see a line before it stays for good.", "", 1)
     tentative_scans: int = parameter(10, "Key scans after which a line that did not come again is dropped.", "", 1)
-    key_distance: float = parameter(0.02, "Movement below which a scan brings nothing new.", "m", 0.0)
-    key_angle: float = parameter(math.radians(0.5), "Rotation below which a scan brings nothing new.", "rad", 0.0)
+    update_distance: float = parameter(0.02, "Filter alone: movement below which a scan adds nothing.", "m", 0.0)
+    update_angle: float = parameter(
+        math.radians(0.5), "Filter alone: rotation below which a scan adds nothing.", "rad", 0.0
+    )
+    match_distance: float = parameter(0.1, "Movement below which a scan is not matched.", "m", 0.0)
+    match_angle: float = parameter(0.1, "Rotation below which a scan is not matched.", "rad", 0.0)
+    key_distance: float = parameter(0.3, "Movement after which a scan becomes a key scan.", "m", 0.0)
+    key_angle: float = parameter(0.3, "Rotation after which a scan becomes a key scan.", "rad", 0.0)
 
 
 @dataclass(frozen=True)

@@ -1,43 +1,18 @@
-"""SLAM: ScanLog -> SlamMap by the line-segment EKF of the paper, method.md sections 1-4."""
+"""SLAM: ScanLog -> SlamMap.
 
-from collections.abc import Iterator
-from typing import NamedTuple
+By default scans are matched to the map of the last ones (tracking), places seen before are recognised and the
+trajectory is smoothed (loops, posegraph), and the line filter maps the walls along it, which sharpen it once more
+(lines, smoothing). With `method` "paper" the line filter works alone, as in the paper.
+"""
 
 import numpy as np
 
-from bsmap_cli.core import se2
 from bsmap_cli.core.noise import range_sigma
 from bsmap_cli.errors import BadInputError
-from bsmap_cli.model import Array, ScanLog, SlamMap, StepStatistics, Trajectory
+from bsmap_cli.model import ScanLog, SlamMap
 from bsmap_cli.params import SlamParams
-from bsmap_cli.slam import filter
-from bsmap_cli.slam.association import find_candidates, partial_compatibility
-from bsmap_cli.slam.filter import FilterState
-from bsmap_cli.slam.motion import Motion, beam_motion, constant_velocity, odometry_motion
-from bsmap_cli.slam.segments import Segments, extract_segments, scan_points
-from bsmap_cli.slam.upkeep import (
-    Landmarks,
-    append,
-    extend,
-    extents_in_map,
-    join_lines,
-    no_landmarks,
-    prune,
-    to_line_map,
-)
+from bsmap_cli.slam.paper import run_paper
 from bsmap_cli.track import Track, silent
-
-BATCH = 128
-"""Scans whose segments are extracted at once: enough to spread the cost, few enough to stay in the cache."""
-
-
-class Step(NamedTuple):
-    """The map after a scan, and what the scan did: new segments, matched pairs, normalised innovation squared."""
-
-    state: FilterState
-    landmarks: Landmarks
-    matched: int
-    nis: float
 
 
 def run_slam(log: ScanLog, params: SlamParams, *, track: Track = silent) -> SlamMap:
@@ -49,97 +24,7 @@ def run_slam(log: ScanLog, params: SlamParams, *, track: Track = silent) -> Slam
         The log has no horizontal scan with a return in it.
     """
     scans = log.horizontal
-    n = len(scans.time_ns)
-    if n == 0 or not np.isfinite(scans.ranges).any():
+    if len(scans.time_ns) == 0 or not np.isfinite(scans.ranges).any():
         raise BadInputError(f"the horizontal laser ({scans.topic}) has no scan with a valid range")
-    poses, covariances = np.empty((n, 3)), np.empty((n, 3, 3))
-    counts, nis = np.zeros((n, 3), int), np.zeros(n)
-    state, landmarks, last_key, step = filter.initial_state(), no_landmarks(), 0, 0
-    motions = _Motions(log, params)
-    for k, segments in enumerate(_segments(log, params)):
-        moved = motions.to(k, poses)
-        if k > 0:
-            state = filter.predict(state, moved.increment, moved.noise)
-        matched = 0
-        # Without odometry only the scan itself can tell that the robot moved.
-        if k == 0 or log.odometry is None or _is_key(poses[last_key], state.pose, params):
-            state, landmarks, matched, nis[k] = _step(state, landmarks, segments, step, params)
-            last_key, step = k, step + 1
-        poses[k], covariances[k] = state.pose, filter.pose_covariance(state)
-        counts[k] = len(segments.scan), len(landmarks.hits), matched
-        track("slam: scans", k + 1, n)
-    statistics = StepStatistics(counts[:, 0], counts[:, 1], counts[:, 2], nis, 2 * counts[:, 2])
-    trajectory = Trajectory(scans.time_ns, poses, covariances)
-    lines = to_line_map(state, landmarks)
-    return SlamMap(trajectory, lines, statistics, log.vertical, scans.mount, scans.frame_id)
-
-
-def _step(state: FilterState, landmarks: Landmarks, segments: Segments, step: int, params: SlamParams) -> Step:
-    """Match the segments, correct pair by pair, store what is new, join what is one, forget what does not last."""
-    candidates = find_candidates(state, landmarks.extents, segments, params.gate, params.overlap_margin)
-    order = np.argsort(_bearings(segments), kind="stable").tolist()
-    chosen = partial_compatibility(candidates, order, params.group_size, params.gate)
-    pairs = [(int(candidates.segment[c]), int(candidates.line[c])) for c in chosen]
-    nis = 0.0
-    for segment, line in pairs:
-        state, distance = filter.update(state, line, segments.parameters[segment], segments.covariances[segment])
-        nis += distance
-    landmarks = extend(state, landmarks, segments, pairs, step)
-    # A segment that fits a line alone but not jointly is neither trusted nor stored a second time.
-    unknown = np.setdiff1d(np.arange(len(segments.scan)), candidates.segment)
-    first_new = len(landmarks.hits)
-    for segment in unknown:
-        state = filter.augment(state, segments.parameters[segment], segments.covariances[segment])
-    seen = extents_in_map(state.pose, segments.parameters[unknown], segments.extents[unknown])
-    landmarks = append(landmarks, seen, step)
-    touched = sorted({line for _, line in pairs} | set(range(first_new, len(landmarks.hits))))
-    same = np.diag([params.line_angle_floor, params.line_offset_floor]) ** 2
-    state, landmarks = join_lines(state, landmarks, touched, params.gate, params.overlap_margin, same)
-    state, landmarks = prune(state, landmarks, step, params.tentative_hits, params.tentative_scans)
-    return Step(state, landmarks, len(pairs), nis)
-
-
-def _bearings(segments: Segments) -> Array:
-    """(k,) direction from the robot to the middle of each segment, radians."""
-    alpha, r = segments.parameters.T
-    middle = segments.extents.mean(axis=1)
-    return se2.wrap(alpha + np.arctan2(middle, r))
-
-
-def _is_key(last: Array, pose: Array, params: SlamParams) -> bool:
-    """Whether the robot moved enough since the last scan that was used for a new one to bring something."""
-    moved = se2.between(last, pose)
-    return bool(np.hypot(moved[0], moved[1]) >= params.key_distance or abs(moved[2]) >= params.key_angle)
-
-
-class _Motions(NamedTuple):
-    """The motion prior from scan to scan, by odometry or, without it, by the velocity of the step before."""
-
-    log: ScanLog
-    params: SlamParams
-
-    def to(self, k: int, poses: Array) -> Motion:
-        """Motion from scan k - 1 to scan k; `poses` (n, 3) holds the estimates up to k - 1."""
-        odometry, time_ns = self.log.odometry, self.log.horizontal.time_ns
-        if k == 0:
-            return Motion(np.zeros(3), np.zeros((3, 3)))
-        if odometry is not None:
-            return odometry_motion(odometry[k - 1], odometry[k], self.params)
-        seconds = max(float(time_ns[k] - time_ns[k - 1]) * 1e-9, 0.0)
-        before = max(float(time_ns[k - 1] - time_ns[k - 2]) * 1e-9, 0.0) if k > 1 else 0.0
-        last = se2.between(poses[k - 2], poses[k - 1]) if k > 1 else np.zeros(3)
-        return constant_velocity(last, before, seconds, self.params)
-
-
-def _segments(log: ScanLog, params: SlamParams) -> Iterator[Segments]:
-    """Segments of each horizontal scan in turn."""
-    scans = log.horizontal
     sigma = params.range_sigma or range_sigma(scans.ranges)
-    mount = se2.from_matrix(scans.mount)
-    motion = beam_motion(log)
-    for start in range(0, len(scans.time_ns), BATCH):
-        stop = min(start + BATCH, len(scans.time_ns))
-        points = scan_points(scans.ranges[start:stop], scans.angles, mount, motion[start:stop], start)
-        found = extract_segments(points, mount[:2], sigma, params)
-        for k in range(start, stop):
-            yield found.of_scan(k)
+    return run_paper(log, sigma, params, track)

@@ -1,0 +1,246 @@
+"""Loop closing: places seen before, recognised by matching small maps of key scans, verified, smoothed over."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bsmap_cli.core import se2
+from bsmap_cli.core.table import take
+from bsmap_cli.model import Array, IntArray
+from bsmap_cli.slam import posegraph
+from bsmap_cli.slam.matching import Match, OrientedPoints, Target, make_target, match, search
+from bsmap_cli.slam.posegraph import Edges
+from bsmap_cli.slam.tracking import Tracking, match_noise
+from bsmap_cli.track import Track
+
+ROUNDS = 8
+SPACING = 1.0
+"""Metres of way between key scans for which loops are sought."""
+WIDE_SPACING, WIDE_TURN, UNHELD = 3.0, 0.5, 10.0
+"""Metres of way between wide searches, radians to both sides, metres of way from any closure where they are made."""
+LEAST_WAY = 8.0
+"""Metres of way that make a return to a place a loop."""
+REACH, DRIFT, MOST_REACH = 2.0, 0.02, 10.0
+"""A place counts as near within REACH metres, and DRIFT more for each metre of way since, up to MOST_REACH."""
+PASSES = 3
+"""Earlier visits to a place that are tried, nearest first."""
+AGREEMENT = 0.7
+"""Share of points that must lie on the other map."""
+SOURCE_KEYS, TARGET_KEYS = 5, 10
+"""Key scans before and after that make the small maps."""
+SOURCE_POINTS = 250
+CLOSURE_FLOOR = (0.02, 0.02, 0.005)
+"""Standard deviations of a closure beside that of the match: metres, metres, radians."""
+WRONG = 25.0
+"""Squared Mahalanobis distance beyond which a closure contradicts all the others."""
+
+
+class Closures(NamedTuple):
+    """The poses that the closures lead to, the closures that hold, and the number of those refused afterwards."""
+
+    poses: Array
+    edges: Edges
+    refused: int
+
+
+class _Search(NamedTuple):
+    """What the search for loops looks at: key scans, their poses and the way to each of them."""
+
+    points: list[OrientedPoints]
+    poses: Array
+    way: Array
+    noise: float
+
+
+def close_loops(tracking: Tracking, range_sigma: float, track: Track) -> Closures:
+    """Find loops, smooth, and look again from the better poses, until nothing new turns up."""
+    poses = tracking.poses[tracking.keys]
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
+    noise = match_noise(range_sigma)
+    closures, tried = _no_edges(), set[tuple[int, int]]()
+    chain = _relinked(tracking, noise)
+    if tracking.weak.any():
+        poses = posegraph.optimise(poses, chain).poses
+    wide = False
+    for k in range(ROUNDS):
+        track("slam: loops", k, ROUNDS)
+        found = _find(_Search(tracking.points, poses, way, noise), tried, _far_from(closures, way) if wide else None)
+        if len(found.first) == 0:
+            if wide:
+                break
+            # Where the poses lead past no known place, they may be too far off for a match without a search.
+            wide = True
+            continue
+        wide = False
+        tried |= set(zip(found.first.tolist(), found.second.tolist(), strict=True))
+        closures = posegraph.concatenate([closures, found])
+        poses = posegraph.optimise(poses, posegraph.concatenate([chain, closures])).poses
+    holds = _holding(poses, closures)
+    edges = posegraph.concatenate([chain, take(closures, holds)])
+    poses = posegraph.optimise(poses, edges).poses
+    relocated = _relocated(tracking, poses, noise)
+    if len(relocated.first):
+        replaced = np.isin(edges.second, relocated.second) & tracking.weak[edges.second] & ~_is_closure(edges)
+        edges = posegraph.concatenate([take(edges, ~replaced), relocated])
+        poses = posegraph.optimise(poses, edges).poses
+    track("slam: loops", ROUNDS, ROUNDS)
+    return Closures(poses, edges, int(np.count_nonzero(~holds)))
+
+
+def _is_closure(edges: Edges) -> NDArray[np.bool_]:
+    """(m,) edges that are not of the chain, whose second key scans ascend one by one."""
+    return np.arange(len(edges.second)) >= edges.second.max(initial=0)
+
+
+def _no_edges() -> Edges:
+    none = np.zeros(0, int)
+    return Edges(none, none, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0, bool))
+
+
+def _holding(poses: Array, closures: Edges) -> NDArray[np.bool_]:
+    """(m,) closures that the smoothed trajectory does not contradict."""
+    distance, _ = posegraph.weighted(closures, posegraph.residuals(poses, closures)[0])
+    return distance < WRONG
+
+
+def _relinked(tracking: Tracking, noise: float) -> Edges:
+    """The chain of key scans, and a robust edge across each run of failed ones: the maps on both sides, matched."""
+    poses = tracking.poses[tracking.keys]
+    look = _Search(tracking.points, poses, np.zeros(len(poses)), noise)
+    parts = [tracking.edges]
+    border = np.flatnonzero(np.diff(np.concatenate([[0], tracking.weak, [0]]).astype(int)))
+    for start, after in border.reshape(-1, 2).tolist():
+        before = start - 1
+        if after - start < 2 or after >= len(poses):
+            continue
+        source = _source(look, after, range(after, min(after + SOURCE_KEYS, len(poses))))
+        target = _target(look, before, range(max(before - TARGET_KEYS, 0), before + 1))
+        found = _register(source, target, se2.between(poses[before], poses[after]), noise, 1.5, 0.8)
+        if found is not None:
+            parts.append(_closure(before, after, found))
+    return posegraph.concatenate(parts)
+
+
+def _far_from(closures: Edges, way: Array) -> NDArray[np.bool_]:
+    """(n,) key scans that are a long way from any that a closure holds."""
+    held = np.sort(way[np.concatenate([closures.first, closures.second])])
+    if len(held) == 0:
+        return np.ones(len(way), bool)
+    next_one = np.searchsorted(held, way).clip(1, len(held) - 1) if len(held) > 1 else np.zeros(len(way), int)
+    return np.minimum(np.abs(way - held[next_one]), np.abs(way - held[next_one - 1])) > UNHELD
+
+
+def _relocated(tracking: Tracking, poses: Array, noise: float) -> Edges:
+    """Edges of failed key scans to the one before, from a match to the smoothed map of those before and after.
+
+    What tracking could not place, for most of what it saw was new or the odometry was wrong, has its place now.
+    """
+    look = _Search(tracking.points, poses, np.zeros(len(poses)), noise)
+    sound = np.flatnonzero(~tracking.weak)
+    found = [_no_edges()]
+    for key in np.flatnonzero(tracking.weak).tolist():
+        at = int(np.searchsorted(sound, key))
+        around = sound[max(at - TARGET_KEYS, 0) : at + TARGET_KEYS]
+        before, after = int(sound[max(at - 1, 0)]), int(sound[min(at, len(sound) - 1)])
+        target = make_target([look.points[j].moved(se2.between(poses[before], poses[j])) for j in around])
+        guesses = [se2.between(poses[before], poses[k]) for k in (key, after, before)]
+        matches = [_register(tracking.points[key], target, guess, noise, 1.5, 0.8) for guess in guesses]
+        best = max((m for m in matches if m is not None), key=lambda m: m.inliers, default=None)
+        if best is not None:
+            found.append(_closure(before, key, best))
+    return posegraph.concatenate(found)
+
+
+def _find(look: _Search, tried: set[tuple[int, int]], wide: NDArray[np.bool_] | None = None) -> Edges:
+    """Closures between places that are near each other by the poses as they are.
+
+    wide : (n,) key scans for which, and only for them, a wider search is made where the match from there fails.
+    """
+    found, targets = [_no_edges()], dict[int, Target]()
+    for here, before in _candidates(look, SPACING if wide is None else WIDE_SPACING):
+        if (before, here) in tried or (wide is not None and not wide[here]):
+            continue
+        if before not in targets:
+            targets[before] = _target(look, before, _around(before, TARGET_KEYS, len(look.poses)))
+        source = _source(look, here, _around(here, SOURCE_KEYS, len(look.poses)))
+        guess = se2.between(look.poses[before], look.poses[here])
+        span = float(_reach(look.way[here] - look.way[before]))
+        closure = _register(source, targets[before], guess, look.noise, span, 0.0 if wide is None else WIDE_TURN)
+        if closure is not None:
+            found.append(_closure(before, here, closure))
+    return posegraph.concatenate(found)
+
+
+def _reach(way: Array) -> Array:
+    return np.minimum(REACH + DRIFT * way, MOST_REACH)
+
+
+def _candidates(look: _Search, spacing: float) -> Iterator[tuple[int, int]]:
+    """Pairs (here, before): every `spacing` metres of way, the nearest key scan of the nearest earlier visits."""
+    next_way = 0.0
+    for here in range(len(look.poses)):
+        if look.way[here] < next_way:
+            continue
+        next_way = look.way[here] + spacing
+        since = look.way[here] - look.way[:here]
+        distance = np.hypot(*(look.poses[:here, :2] - look.poses[here, :2]).T)
+        near = np.flatnonzero((since > LEAST_WAY) & (distance < _reach(since)))
+        if len(near) == 0:
+            continue
+        visits = np.split(near, np.flatnonzero(np.diff(look.way[near]) > 2 * REACH) + 1)
+        nearest = sorted((visit[np.argmin(distance[visit])] for visit in visits), key=lambda j: distance[j])
+        for before in nearest[:PASSES]:
+            yield here, int(before)
+
+
+def _around(centre: int, half: int, count: int) -> range:
+    return range(max(centre - half, 0), min(centre + half + 1, count))
+
+
+def _source(look: _Search, centre: int, keys: range) -> OrientedPoints:
+    """Points of key scans in the frame of one of them, thinned."""
+    parts = [look.points[j].moved(se2.between(look.poses[centre], look.poses[j])) for j in keys]
+    thin = slice(None, None, max(1, sum(len(p.xy) for p in parts) // SOURCE_POINTS))
+    return OrientedPoints(*(np.concatenate(field)[thin] for field in zip(*parts, strict=True)))
+
+
+def _target(look: _Search, centre: int, keys: range) -> Target:
+    return make_target([look.points[j].moved(se2.between(look.poses[centre], look.poses[j])) for j in keys])
+
+
+def _register(
+    source: OrientedPoints, target: Target, guess: Array, noise: float, span: float, turn: float
+) -> Match | None:
+    """Match of two small maps, from the guess; None where they do not agree."""
+    loose = np.diag([0.01, 0.01, 0.25])
+    found = match(source, target, guess, loose, noise, reach=1.0)
+    if found.inliers >= AGREEMENT:
+        return found
+    if turn == 0.0:
+        return None
+    for start in search(source, target, guess, span, turn):
+        coarse = match(source, target, start, loose, noise, max(0.5, span / 6))
+        if coarse.inliers > found.inliers:
+            found = coarse
+    return found if found.inliers >= AGREEMENT else None
+
+
+def _closure(first: int, second: int, found: Match) -> Edges:
+    """Edge of a match, with what a match can be off by although it looks good."""
+    covariance = np.linalg.inv(found.information / 4 + 1e-3 * np.eye(3)) + np.diag(CLOSURE_FLOOR) ** 2
+    information = np.linalg.inv(covariance)
+    return Edges(np.array([first]), np.array([second]), found.pose[None], information[None], np.array([True]))
+
+
+def all_poses(tracking: Tracking, key_poses: Array) -> Array:
+    """(n, 3) poses of every scan: the scans between two key scans keep their place relative to both."""
+    n, keys = len(tracking.poses), tracking.keys
+    before = np.searchsorted(keys, np.arange(n), side="right") - 1
+    return se2.compose(key_poses[before], se2.between(tracking.poses[keys[before]], tracking.poses))
+
+
+def key_of(tracking: Tracking) -> IntArray:
+    """(n,) key scan at or before each scan."""
+    return np.searchsorted(tracking.keys, np.arange(len(tracking.poses)), side="right") - 1

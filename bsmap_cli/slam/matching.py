@@ -1,0 +1,181 @@
+"""Scan matching: points of a scan on the points and normals of a map, point to line, robust, with a prior.
+
+Censi (2008) for the metric, with a Cauchy loss whose width shrinks from the reach of the search to the noise.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from bsmap_cli.core import se2
+from bsmap_cli.model import Array, IntArray
+from bsmap_cli.slam.segments import ScanPoints
+
+NORMAL_REACH = 0.12
+"""Metres to each side over which a point's normal is fitted."""
+
+
+SEARCH_POINTS = 70
+SEARCH_STEP, SEARCH_STEPS, SEARCH_ANGLE = 0.3, 8, 0.12
+"""Points looked at; steps of the grid of starts in metres and radians, wider where too many would be needed."""
+SAME_WAY = 0.7
+"""Cosine of the angle between normals above which two points can be of one surface."""
+
+
+class OrientedPoints(NamedTuple):
+    """xy : (n, 2), metres.  normal : (n, 2), unit, towards the laser that saw the point."""
+
+    xy: Array
+    normal: Array
+
+    def moved(self, pose: Array) -> "OrientedPoints":
+        """In the frame in which `pose` (3,), or poses that broadcast (..., 1, 3), are given."""
+        turn = pose * [0.0, 0.0, 1.0]
+        return OrientedPoints(se2.transform(pose, self.xy), se2.transform(turn, self.normal))
+
+
+class Target(NamedTuple):
+    """Map to match against: its points and a spatial index of them."""
+
+    points: OrientedPoints
+    tree: cKDTree
+
+
+class Match(NamedTuple):
+    """pose : (3,), of the scan in the map's frame.  information : (3, 3) of the match alone, without the prior.
+
+    inliers : share of the scan's points that lie on the map.  rms : metres, of the inliers.
+    """
+
+    pose: Array
+    information: Array
+    inliers: float
+    rms: float
+
+
+def make_target(parts: list[OrientedPoints]) -> Target:
+    """Target of points given in one frame."""
+    points = OrientedPoints(np.concatenate([p.xy for p in parts]), np.concatenate([p.normal for p in parts]))
+    return Target(points, cKDTree(points.xy, balanced_tree=False, compact_nodes=False))
+
+
+def nearest_points(target: Target, xy: Array, reach: float) -> tuple[Array, IntArray]:
+    """Distances (k,) and indices (k,) of the target's points nearest to `xy` (k, 2); infinite beyond `reach`."""
+    distance, index = target.tree.query(xy, distance_upper_bound=reach)
+    return np.asarray(distance), np.asarray(index)
+
+
+def oriented_points(points: ScanPoints, laser_xy: Array, range_sigma: float) -> tuple[OrientedPoints, IntArray]:
+    """Points whose normal is well known, and which ones of `points` they are.
+
+    The normal is that of the best line through neighbouring points of one surface, by running sums of moments.
+    """
+    n = len(points.scan)
+    near = np.hypot(*np.diff(points.xy, axis=0).T)
+    step = np.median(np.diff(points.angle)[np.diff(points.beam) == 1]) if n > 1 else 0.0
+    jump = (near > 0.15 + 6 * np.abs(step) * points.range[:-1]) | (np.diff(points.scan) != 0)
+    group = np.r_[0, np.cumsum(jump)]
+    first = np.searchsorted(group, group, "left")
+    last = np.searchsorted(group, group, "right")
+    half = np.clip(np.rint(NORMAL_REACH / np.maximum(points.range * abs(step), 1e-4)), 2, 12).astype(int)
+    index = np.arange(n)
+    half = np.minimum(half, np.maximum(np.minimum(index - first, last - 1 - index), 1))
+    low, high = np.maximum(index - half, first), np.minimum(index + half + 1, last)
+    x, y = points.xy[:, 0], points.xy[:, 1]
+    sums = np.zeros((n + 1, 5))
+    np.cumsum(np.stack([x, y, x * x, x * y, y * y], axis=1), axis=0, out=sums[1:])
+    count = high - low
+    m = (sums[high] - sums[low]) / np.maximum(count, 1)[:, None]
+    xx, xy, yy = m[:, 2] - m[:, 0] ** 2, m[:, 3] - m[:, 0] * m[:, 1], m[:, 4] - m[:, 1] ** 2
+    angle = 0.5 * np.arctan2(2 * xy, xx - yy)
+    normal = np.stack([-np.sin(angle), np.cos(angle)], axis=1)
+    spread = np.sqrt(((xx - yy) / 2) ** 2 + xy**2)
+    across, along = (xx + yy) / 2 - spread, (xx + yy) / 2 + spread
+    away = np.einsum("ij,ij->i", normal, points.xy - laser_xy) > 0
+    normal[away] *= -1
+    good = (count >= 3) & (across < 0.15 * along) & (across < (5 * range_sigma) ** 2)
+    return OrientedPoints(points.xy[good], normal[good]), np.flatnonzero(good)
+
+
+def match(
+    source: OrientedPoints,
+    target: Target,
+    initial: Array,
+    prior: Array,
+    range_sigma: float,
+    reach: float = 0.5,
+    iterations: int = 20,
+) -> Match:
+    """Best pose of `source` on `target`, Gauss-Newton from `initial` (3,).
+
+    prior : (3, 3) information of the initial pose, in the target's frame; what the points do not tell stays there.
+    reach : metres within which points can pair at first.
+    """
+    pose = initial.copy()
+    floor = max(2 * range_sigma, 0.05)
+    n = len(source.xy)
+    for _ in range(iterations):
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        R = np.array([[c, s], [-s, c]])
+        turned = source.xy @ R
+        moved = turned + pose[:2]
+        distance, nearest = nearest_points(target, moved, reach)
+        hit = np.flatnonzero(distance < reach)
+        if len(hit) < 5:
+            return Match(initial, np.zeros((3, 3)), 0.0, 0.0)
+        nearest = nearest[hit]
+        normal = target.points.normal[nearest]
+        same = np.einsum("ij,ij->i", source.normal[hit] @ R, normal) > SAME_WAY
+        hit, nearest, normal = hit[same], nearest[same], normal[same]
+        e = np.einsum("ij,ij->i", moved[hit] - target.points.xy[nearest], normal)
+        lever = turned[hit]
+        J = np.stack([normal[:, 0], normal[:, 1], normal[:, 1] * lever[:, 0] - normal[:, 0] * lever[:, 1]], axis=1)
+        width = max(floor, reach / 4)
+        w = 1.0 / (1.0 + (e / width) ** 2)
+        wJ = J * (w / range_sigma**2)[:, None]
+        information = wJ.T @ J
+        away = pose - initial
+        away[2] = se2.wrap(away[2])
+        step = np.linalg.solve(information + prior, -(wJ.T @ e) - prior @ away)
+        pose += step
+        small = abs(step[0]) + abs(step[1]) < 1e-3 and abs(step[2]) < 5e-4
+        if small and reach <= 0.1501:
+            break
+        reach = max(0.15, reach * 0.6)
+    on = np.abs(e) < floor
+    pose[2] = se2.wrap(pose[2])
+    rms = float(np.sqrt(np.mean(e[on] ** 2))) if on.any() else 0.0
+    return Match(pose, information, float(on.sum()) / max(n, 1), rms)
+
+
+def search(
+    source: OrientedPoints, target: Target, initial: Array, span: float, turn: float, best: int = 3
+) -> list[Array]:
+    """Best poses on a grid of starts about `initial`: within `span` metres and `turn` radians, nearest first of equals.
+
+    Each start is judged by how many of some points of the source lie near points of the target that face their way.
+    """
+    thin = slice(None, None, max(1, len(source.xy) // SEARCH_POINTS))
+    points = OrientedPoints(source.xy[thin], source.normal[thin])
+    step = max(SEARCH_STEP, span / SEARCH_STEPS)
+    sigma = 0.8 * step
+    angles = initial[2] + _centred(turn, SEARCH_ANGLE)
+    shifts = np.stack(np.meshgrid(_centred(span, step), _centred(span, step)), axis=-1).reshape(-1, 2)
+    turned = points.moved(np.stack([0 * angles, 0 * angles, angles], axis=-1)[:, None])
+    places = turned.xy[:, None] + initial[:2] + shifts[None, :, None]
+    normals = np.broadcast_to(turned.normal[:, None], places.shape).reshape(-1, 2)
+    distance, nearest = nearest_points(target, places.reshape(-1, 2), 3 * sigma)
+    near = np.flatnonzero(np.isfinite(distance))
+    near = near[np.einsum("ij,ij->i", target.points.normal[nearest[near]], normals[near]) > SAME_WAY]
+    score = np.zeros(len(distance))
+    score[near] = np.exp(-0.5 * (distance[near] / sigma) ** 2)
+    order = np.argsort(-score.reshape(len(angles) * len(shifts), -1).mean(axis=1), kind="stable")[:best]
+    return [np.array([*(initial[:2] + shifts[k % len(shifts)]), angles[k // len(shifts)]]) for k in order]
+
+
+def _centred(reach: float, step: float) -> Array:
+    """Values from -reach to reach in steps about 0, by distance from 0."""
+    count = int(np.floor(reach / step + 1e-9))
+    values = step * np.arange(-count, count + 1, dtype=np.float64)
+    return values[np.argsort(np.abs(values), kind="stable")]

@@ -1,0 +1,119 @@
+"""Pose graph in the plane: sparse Gauss-Newton with a robust loss (Grisetti et al. 2010; Kuemmerle et al. 2011)."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import SuperLU, splu
+
+from bsmap_cli.core import se2
+from bsmap_cli.errors import BsmapError
+from bsmap_cli.model import Array, IntArray
+
+ITERATIONS = 30
+ROBUST_WIDTH = 9.0
+"""Squared Mahalanobis distance at which the weight of a robust edge has fallen to one half (Cauchy)."""
+
+
+class Edges(NamedTuple):
+    """Relative poses between nodes.
+
+    first, second : (m,) nodes.  relative : (m, 3), of the second in the first's frame.  information : (m, 3, 3) there.
+    robust : (m,) whether the edge may be wrong: it then loses weight as it disagrees.
+    """
+
+    first: IntArray
+    second: IntArray
+    relative: Array
+    information: Array
+    robust: NDArray[np.bool_]
+
+
+class Solution(NamedTuple):
+    """poses : (n, 3).  distances : (m,) squared Mahalanobis distance of each edge."""
+
+    poses: Array
+    distances: Array
+
+
+def concatenate(parts: list[Edges]) -> Edges:
+    """All edges of several sets."""
+    return Edges(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
+
+
+def residuals(poses: Array, edges: Edges) -> tuple[Array, Array, Array]:
+    """Errors (m, 3) of the edges and their derivatives (m, 3, 3) by the first and by the second pose."""
+    a, b = poses[edges.first], poses[edges.second]
+    c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
+    relative = se2.between(a, b)
+    error = relative - edges.relative
+    error[:, 2] = se2.wrap(error[:, 2])
+    by_first, by_second = np.zeros((len(a), 3, 3)), np.zeros((len(a), 3, 3))
+    by_second[:, 0, 0], by_second[:, 0, 1], by_second[:, 1, 0], by_second[:, 1, 1] = c, s, -s, c
+    by_second[:, 2, 2] = 1.0
+    by_first[:, :2, :2] = -by_second[:, :2, :2]
+    by_first[:, 0, 2], by_first[:, 1, 2] = relative[:, 1], -relative[:, 0]
+    by_first[:, 2, 2] = -1.0
+    return error, by_first, by_second
+
+
+def weighted(edges: Edges, error: Array) -> tuple[Array, Array]:
+    """Squared distances (m,) of errors (m, 3), and the edges' information (m, 3, 3) times their robust weight."""
+    distance = np.einsum("mi,mij,mj->m", error, edges.information, error)
+    weight = np.where(edges.robust, 1.0 / (1.0 + distance / ROBUST_WIDTH), 1.0)
+    return distance, edges.information * weight[:, None, None]
+
+
+def block_matrix(rows: IntArray, columns: IntArray, blocks: Array, size: int) -> sparse.csc_matrix:
+    """Sparse (size, size) matrix of blocks (k, a, b) whose first entries are at `rows` and `columns` (k,); sums."""
+    a, b = blocks.shape[1:]
+    row = np.broadcast_to(rows[:, None, None] + np.arange(a)[:, None], blocks.shape)
+    column = np.broadcast_to(columns[:, None, None] + np.arange(b), blocks.shape)
+    return sparse.csc_matrix((blocks.ravel(), (row.ravel(), column.ravel())), shape=(size, size))
+
+
+def edge_blocks(
+    edges: Edges, weights: Array, error: Array, by_first: Array, by_second: Array
+) -> tuple[list[tuple[IntArray, IntArray, Array]], list[tuple[IntArray, Array]]]:
+    """Blocks (rows, columns, values) of the normal matrix and (rows, values) of its right-hand side."""
+    i, j = 3 * edges.first, 3 * edges.second
+    first_w, second_w = np.swapaxes(by_first, 1, 2) @ weights, np.swapaxes(by_second, 1, 2) @ weights
+    cross = first_w @ by_second
+    matrix = [
+        (i, i, first_w @ by_first),
+        (j, j, second_w @ by_second),
+        (i, j, cross),
+        (j, i, np.swapaxes(cross, 1, 2)),
+    ]
+    return matrix, [(i, -np.einsum("mij,mj->mi", first_w, error)), (j, -np.einsum("mij,mj->mi", second_w, error))]
+
+
+def factorise(matrix: sparse.csc_matrix) -> SuperLU:
+    """Sparse factors of a symmetric positive definite matrix; BsmapError where it is singular."""
+    try:
+        return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    except RuntimeError as error:
+        raise BsmapError("the pose graph falls into parts that nothing connects") from error
+
+
+def optimise(poses: Array, edges: Edges) -> Solution:
+    """Most probable poses (n, 3) under the edges, the first one held."""
+    n = len(poses)
+    poses = poses.copy()
+    for _ in range(ITERATIONS):
+        error, by_first, by_second = residuals(poses, edges)
+        _, weights = weighted(edges, error)
+        blocks, sides = edge_blocks(edges, weights, error, by_first, by_second)
+        rows, columns, values = (np.concatenate(part) for part in zip(*blocks, strict=True))
+        matrix = block_matrix(rows, columns, values, 3 * n)
+        side = np.zeros(3 * n)
+        for row, value in sides:
+            np.add.at(side, row[:, None] + np.arange(3), value)
+        step = factorise(matrix[3:, 3:]).solve(side[3:]).reshape(-1, 3)
+        poses[1:] += step
+        poses[:, 2] = se2.wrap(poses[:, 2])
+        if np.abs(step).max(initial=0.0) < 1e-5:
+            break
+    distance, _ = weighted(edges, residuals(poses, edges)[0])
+    return Solution(poses, distance)

@@ -1,0 +1,185 @@
+"""Tracking: every scan that moved is matched to the map of the last key scans, started from the motion prior."""
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bsmap_cli.core import se2
+from bsmap_cli.model import Array, IntArray, ScanLog
+from bsmap_cli.params import SlamParams
+from bsmap_cli.slam.matching import (
+    Match,
+    OrientedPoints,
+    Target,
+    make_target,
+    match,
+    oriented_points,
+    search,
+)
+from bsmap_cli.slam.motion import Motion, beam_motion, constant_velocity, odometry_motion
+from bsmap_cli.slam.posegraph import Edges
+from bsmap_cli.slam.segments import scan_points
+from bsmap_cli.track import Track
+
+BATCH = 128
+WINDOW = 10
+"""Key scans that make the local map: enough to reach behind a robot that sees 180 degrees."""
+GOOD, WEAK, FAR = 0.75, 0.5, 16.0
+"""Shares of points on the map: below the first one a wider search is worth its time; below the second, or below the
+first so far from the prediction (squared Mahalanobis distance), the match is not believed and the prediction stands."""
+MOST_POINTS = 400
+LEAST_SPREAD = np.array([0.02, 0.02, 0.01])
+"""Metres and radians by which a prediction can be off however short the step."""
+
+
+class Tracking(NamedTuple):
+    """poses : (n, 3), of every scan, in the frame of the first.  keys : (k,) scans that became key scans.
+
+    points : of each key scan, in base_link.  edges : from each key scan but the first to an earlier one.
+    weak : (k,) key scans whose match failed, so that their edge holds no more than the motion prior.
+    """
+
+    poses: Array
+    keys: IntArray
+    points: list[OrientedPoints]
+    edges: Edges
+    weak: NDArray[np.bool_]
+
+
+def track_scans(log: ScanLog, range_sigma: float, params: SlamParams, track: Track) -> Tracking:
+    """Poses of all scans by matching each to the local map."""
+    n = len(log.horizontal.time_ns)
+    poses = np.zeros((n, 3))
+    keys, key_points, information, inliers = [0], [], [], [1.0]
+    last, before = 0, 0
+    noise = match_noise(range_sigma)
+    scans = _points_of_scans(log, range_sigma)
+    key_points.append(next(scans))
+    target = make_target(key_points)
+    for k, points in enumerate(scans, 1):
+        track("slam: tracking", k + 1, n)
+        prior = _motion(log, poses, before, last, k, params)
+        predicted = se2.compose(poses[last], prior.increment)
+        poses[k] = predicted
+        if log.odometry is not None and not _moved(prior.increment, params.match_distance, params.match_angle):
+            continue
+        found = _match(points, target, predicted, prior, noise)
+        poses[k] = found.pose
+        before, last = last, k
+        step = se2.between(poses[keys[-1]], poses[k])
+        if not _moved(step, params.key_distance, params.key_angle):
+            continue
+        inliers.append(found.inliers)
+        information.append(_edge_information(found, predicted, prior))
+        keys.append(k)
+        key_points.append(points)
+        target = make_target([key_points[j].moved(poses[keys[j]]) for j in _local(inliers)])
+    chain = _chain(poses[keys], information, np.array(inliers))
+    return Tracking(poses, np.array(keys), key_points, chain, np.array(inliers) < WEAK)
+
+
+def _local(inliers: list[float]) -> list[int]:
+    """Last key scans that make the local map: a single failed one stays out, for its place is doubtful.
+
+    Of several in a row, as where the robot turns into a room that it has not seen, each helps to place the next.
+    """
+    failed = np.concatenate([[False], np.array(inliers[-WINDOW - 1 :]) < WEAK, [False]])
+    alone = failed[1:-1] & ~failed[:-2] & ~failed[2:]
+    first = len(inliers) - len(alone)
+    return [first + int(j) for j in np.flatnonzero(~alone)][-WINDOW:]
+
+
+def match_noise(range_sigma: float) -> float:
+    """Standard deviation of a point's distance to the map, metres: walls are rough, and neighbours err together."""
+    return max(3 * range_sigma, 0.03)
+
+
+def _moved(increment: Array, distance: float, angle: float) -> bool:
+    return bool(np.hypot(increment[0], increment[1]) >= distance or abs(increment[2]) >= angle)
+
+
+def _motion(log: ScanLog, poses: Array, before: int, last: int, k: int, params: SlamParams) -> Motion:
+    """Prior of the motion from scan `last` to scan k."""
+    if log.odometry is not None:
+        return odometry_motion(log.odometry[last], log.odometry[k], params)
+    time = log.horizontal.time_ns
+    seconds, earlier = (max(float(d) * 1e-9, 0.0) for d in (time[k] - time[last], time[last] - time[before]))
+    return constant_velocity(se2.between(poses[before], poses[last]), earlier, seconds, params)
+
+
+def _match(points: OrientedPoints, target: Target, predicted: Array, prior: Motion, noise: float) -> Match:
+    """Match from the prediction; where that is poor, from the best places of a wider search; else the prediction."""
+    spread = np.sqrt(np.diag(prior.noise)) + LEAST_SPREAD
+    information = np.diag(1.0 / spread**2)
+    reach = float(np.clip(0.2 + 4 * spread[0] + 2 * spread[2], 0.3, 1.0))
+    best = match(points, target, predicted, information, noise, reach)
+    if best.inliers >= GOOD and _departure(best, predicted, information) < 9.0:
+        return best
+    span, turn = min(0.3 + 3 * spread[0], 1.5), min(0.12 + 3 * spread[2], 1.0)
+    loose = information / 100
+    for start in search(points, target, predicted, span, turn):
+        coarse = match(points, target, start, loose, noise, 0.5)
+        fine = match(points, target, coarse.pose, loose, noise, 0.15)
+        if _worth(fine, predicted, information) > _worth(best, predicted, information):
+            best = fine
+    credible = best.inliers >= (WEAK if _departure(best, predicted, information) < FAR else GOOD)
+    return best if credible else Match(predicted, np.zeros((3, 3)), 0.0, 0.0)
+
+
+def _departure(found: Match, predicted: Array, information: Array) -> float:
+    away = found.pose - predicted
+    away[2] = se2.wrap(away[2])
+    return float(away @ information @ away)
+
+
+def _worth(found: Match, predicted: Array, information: Array) -> float:
+    """Share of points on the map, less what leaving the prediction costs.
+
+    A robot that turns where it has not been sees little that it knows: only a much better match may contradict the
+    prediction, and then (a slipping wheel, lost scans) how far it does so no longer matters.
+    """
+    return found.inliers - 0.02 * min(_departure(found, predicted, information), 15.0)
+
+
+def _edge_information(found: Match, predicted: Array, prior: Motion) -> Array:
+    """(3, 3) information of the step to a key scan, in the frame of its prediction; a failed match adds nothing."""
+    odometry = np.linalg.inv(prior.noise + np.diag(LEAST_SPREAD) ** 2)
+    if found.inliers < WEAK:
+        return odometry / 4
+    c, s = np.cos(predicted[2]), np.sin(predicted[2])
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return np.linalg.inv(np.linalg.inv(R.T @ found.information @ R + odometry) + np.diag([0.003, 0.003, 0.0015]) ** 2)
+
+
+def _chain(poses: Array, information: list[Array], inliers: Array) -> Edges:
+    """Edges between key scans: from the one before or, past a single failed one, from the one before that.
+
+    For a match is one to the map of all. A failed one hangs on the last sound one: a single bad reading of the odometry
+    may be all there is to it. Edges of a poor match may give way where loops contradict them.
+    """
+    second = np.arange(1, len(poses))
+    failed = inliers < WEAK
+    before = np.concatenate([[False], failed])  # shifted by one, so that there is one before the first
+    alone = failed[second - 1] & ~before[second - 1] & ~failed[second]
+    sound = np.maximum.accumulate(np.where(failed, 0, np.arange(len(poses))))
+    first = np.where(failed[second], sound[second - 1], second - 1 - alone)
+    relative = se2.between(poses[first], poses[second])
+    return Edges(first, second, relative, np.array(information).reshape(-1, 3, 3), inliers[1:] < GOOD)
+
+
+def _points_of_scans(log: ScanLog, range_sigma: float) -> Iterator[OrientedPoints]:
+    """Oriented points of each horizontal scan in turn, at most MOST_POINTS of each."""
+    scans = log.horizontal
+    mount = se2.from_matrix(scans.mount)
+    motion = beam_motion(log)
+    for start in range(0, len(scans.time_ns), BATCH):
+        stop = min(start + BATCH, len(scans.time_ns))
+        points = scan_points(scans.ranges[start:stop], scans.angles, mount, motion[start:stop], start)
+        oriented, index = oriented_points(points, mount[:2], range_sigma)
+        border = np.searchsorted(points.scan[index], np.arange(start, stop + 1))
+        for a, b in pairwise(border.tolist()):
+            step = -(-(b - a) // MOST_POINTS) or 1
+            yield OrientedPoints(oriented.xy[a:b:step], oriented.normal[a:b:step])

@@ -4,9 +4,9 @@ import logging
 import os
 import signal
 import sys
+from typing import Any
 
 import click
-from click.utils import PacifyFlushWrapper
 
 from bsmap_cli import __version__
 from bsmap_cli.cli.cloud import cloud
@@ -29,6 +29,13 @@ class InOrder(click.Group):
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(self.commands)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command; click itself would make a failure of a reader that has gone."""
+        try:
+            return super().invoke(ctx)
+        except BrokenPipeError:
+            return _reader_gone()
 
 
 @click.group(cls=InOrder, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
@@ -73,11 +80,6 @@ def _guarded() -> int:
         return _fail(str(error), error.exit_code)
     except BrokenPipeError:
         return _reader_gone()
-    except SystemExit:
-        # Click makes an exit of a broken pipe.
-        if isinstance(sys.stdout, PacifyFlushWrapper):
-            return _reader_gone()
-        raise
     except MemoryError:
         return _fail("out of memory: use a machine with more, or a shorter log", 1)
     except Exception as error:

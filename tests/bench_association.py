@@ -25,11 +25,11 @@ from foreign_logs import FOREIGN, LOGS
 from scenes import simulated
 from test_slam_association import World
 
-import bsmap_cli.slam as slam
 from bsmap_cli.io.carmen import import_carmen
 from bsmap_cli.io.log import read_log, write_log
 from bsmap_cli.model import ScanLog
 from bsmap_cli.params import SlamParams
+from bsmap_cli.slam import paper, run_slam
 from bsmap_cli.slam.association import Candidates, best_joint_match, partial_compatibility
 
 LIMIT = 0.2  # s
@@ -78,12 +78,12 @@ def compare(log: ScanLog, params: SlamParams) -> np.ndarray:
         rows.append((len(seen), len(candidates.segment), middle - start, end - middle, len(chosen), size))
         return chosen
 
-    original = slam.partial_compatibility
-    slam.partial_compatibility = both
+    original = paper.partial_compatibility
+    paper.partial_compatibility = both
     try:
-        slam.run_slam(log, params)
+        run_slam(log, params)
     finally:
-        slam.partial_compatibility = original
+        paper.partial_compatibility = original
     return np.array(rows)
 
 

@@ -52,8 +52,9 @@ class LogParams(Checked):
 
 @dataclass(frozen=True)
 class SlamParams(Checked):
-    """Line-segment EKF SLAM, method.md sections 1-4."""
+    """Trajectory and line map, method.md sections 1-4 and 10."""
 
+    method: str = parameter("graph", "Smoothed graph, or the paper's filter alone.", choices=("graph", "paper"))
     range_sigma: float | None = parameter(
         None, "Standard deviation of a range (default: from the log).", "m", 1e-4, 1.0
     )

@@ -11,6 +11,7 @@ from bsmap_cli.core.noise import range_sigma
 from bsmap_cli.errors import BadInputError
 from bsmap_cli.model import ScanLog, SlamMap
 from bsmap_cli.params import SlamParams
+from bsmap_cli.slam.graph import run_graph
 from bsmap_cli.slam.paper import run_paper
 from bsmap_cli.track import Track, silent
 
@@ -27,4 +28,5 @@ def run_slam(log: ScanLog, params: SlamParams, *, track: Track = silent) -> Slam
     if len(scans.time_ns) == 0 or not np.isfinite(scans.ranges).any():
         raise BadInputError(f"the horizontal laser ({scans.topic}) has no scan with a valid range")
     sigma = params.range_sigma or range_sigma(scans.ranges)
-    return run_paper(log, sigma, params, track)
+    run = run_paper if params.method == "paper" else run_graph
+    return run(log, sigma, params, track)

@@ -8,6 +8,7 @@ buffers: a state given to one of them must not be used afterwards, only the one 
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.linalg.blas import dsyrk
 
 from bsmap_cli.core import se2
@@ -120,17 +121,23 @@ def constrain_equal(state: FilterState, first: int, second: int, noise: Array) -
     return _correct(state, cross, S, difference)[0]
 
 
+def update_pose(state: FilterState, pose: Array, noise: Array) -> FilterState:
+    """Correct by a pose (3,) known from elsewhere, with covariance `noise` (3, 3)."""
+    cross = _columns(state, 0, 3)
+    innovation = pose - state.pose
+    innovation[2] = se2.wrap(innovation[2])
+    return _correct(state, cross, cross[:3] + noise, innovation)[0]
+
+
 def _correct(state: FilterState, cross: Array, S: Array, innovation: Array) -> tuple[FilterState, float]:
-    """State corrected by an innovation (2,) with covariance S (2, 2); cross : (size, 2) = P H'."""
-    S = (S + S.T) / 2
+    """State corrected by an innovation (k,) with covariance S (k, k); cross : (size, k) = P H'."""
     try:
-        L = np.linalg.cholesky(S)
+        L = np.linalg.cholesky((S + S.T) / 2)
     except np.linalg.LinAlgError as error:
         raise BsmapError("the filter's innovation covariance is no longer positive definite") from error
-    inverse = np.array([[1 / L[0, 0], 0.0], [-L[1, 0] / (L[0, 0] * L[1, 1]), 1 / L[1, 1]]])
-    whitened = inverse @ innovation
-    W = np.zeros((len(state.mean), 2), order="F")
-    W[: state.size] = cross @ inverse.T
+    whitened = solve_triangular(L, innovation, lower=True, check_finite=False)
+    W = np.zeros((len(state.mean), len(innovation)), order="F")
+    W[: state.size] = solve_triangular(L, cross.T, lower=True, check_finite=False).T
     state.mean[: state.size] += W[: state.size] @ whitened
     state.mean[2] = se2.wrap(state.mean[2])
     P = dsyrk(-1.0, W, beta=1.0, c=state.covariance, lower=1, overwrite_c=1)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from bsmap_cli.core import se2
 from bsmap_cli.core.table import take
-from bsmap_cli.model import Array, IntArray
+from bsmap_cli.model import Array
 from bsmap_cli.slam import posegraph
 from bsmap_cli.slam.matching import Match, OrientedPoints, Target, make_target, match, search
 from bsmap_cli.slam.posegraph import Edges
@@ -232,15 +232,3 @@ def _closure(first: int, second: int, found: Match) -> Edges:
     covariance = np.linalg.inv(found.information / 4 + 1e-3 * np.eye(3)) + np.diag(CLOSURE_FLOOR) ** 2
     information = np.linalg.inv(covariance)
     return Edges(np.array([first]), np.array([second]), found.pose[None], information[None], np.array([True]))
-
-
-def all_poses(tracking: Tracking, key_poses: Array) -> Array:
-    """(n, 3) poses of every scan: the scans between two key scans keep their place relative to both."""
-    n, keys = len(tracking.poses), tracking.keys
-    before = np.searchsorted(keys, np.arange(n), side="right") - 1
-    return se2.compose(key_poses[before], se2.between(tracking.poses[keys[before]], tracking.poses))
-
-
-def key_of(tracking: Tracking) -> IntArray:
-    """(n,) key scan at or before each scan."""
-    return np.searchsorted(tracking.keys, np.arange(len(tracking.poses)), side="right") - 1

@@ -135,16 +135,20 @@ def _near_lines(lines: Array, extents: Array, line: int, margin: float) -> IntAr
 
 
 def to_line_map(state: FilterState, landmarks: Landmarks) -> LineMap:
-    """The stored lines with r >= 0; the side tells from where they were seen."""
+    """The filter's lines as they are stored in the map."""
     parameters = state.lines.copy()
-    m = len(parameters)
-    index = 3 + 2 * np.arange(m)[:, None] + np.arange(2)
+    index = 3 + 2 * np.arange(len(parameters))[:, None] + np.arange(2)
     rows, columns = np.maximum(index[:, :, None], index[:, None]), np.minimum(index[:, :, None], index[:, None])
-    covariances, extents = state.covariance[rows, columns], landmarks.extents.copy()
+    return with_positive_offset(parameters, state.covariance[rows, columns], landmarks.extents, landmarks.hits)
+
+
+def with_positive_offset(parameters: Array, covariances: Array, extents: Array, hits: IntArray) -> LineMap:
+    """Lines (m, 2) whose n points away from where they were seen, turned to r >= 0; the side tells from where."""
+    parameters, covariances, extents = parameters.copy(), covariances.copy(), extents.copy()
     flip = parameters[:, 1] < 0
     parameters[flip] = parameters[flip] * [1, -1] + [np.pi, 0]
     extents[flip] = -extents[flip][:, ::-1]
     covariances[flip, 0, 1] *= -1
     covariances[flip, 1, 0] *= -1
     parameters[:, 0] = se2.wrap(parameters[:, 0])
-    return LineMap(parameters, covariances, extents, np.where(flip, 1, -1), landmarks.hits)
+    return LineMap(parameters, covariances, extents, np.where(flip, 1, -1), hits)

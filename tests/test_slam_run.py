@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from bsmap_cli.core import se2
 from bsmap_cli.errors import BadInputError
-from bsmap_cli.evaluate import align
+from bsmap_cli.evaluate import align, distance_to_mesh, transform_points
 from bsmap_cli.model import ScanLog, SlamMap
 from bsmap_cli.params import SlamParams
 from bsmap_cli.slam import run_slam
@@ -63,6 +63,19 @@ def test_corridor_in_motion_is_tracked_and_the_map_stays_small(corridor):
     assert covariances_are_sound(slam)
     assert len(slam.lines.hits) < 100
     assert slam.statistics.stored.max() < 150
+
+
+def test_segments_of_the_map_end_where_the_walls_do(corridor):
+    """Both ends of what was seen often lie on the scene, though the lines were turned since they were first seen."""
+    simulation = simulated("corridor")
+    lines = run_slam(part(corridor, slice(0, 400)), PARAMS).lines
+    (alpha, r), often = lines.parameters.T, lines.hits > 10
+    n, t = np.stack([np.cos(alpha), np.sin(alpha)], -1), np.stack([-np.sin(alpha), np.cos(alpha)], -1)
+    ends = (n * r[:, None])[:, None] + t[:, None] * lines.extents[..., None]
+    first = simulation.truth.poses[np.searchsorted(simulation.truth.time_ns, corridor.horizontal.time_ns[0])]
+    height = np.full((2 * np.count_nonzero(often), 1), 0.35)
+    points = transform_points(first, np.c_[ends[often].reshape(-1, 2), height])
+    assert distance_to_mesh(points, simulation.vertices, simulation.triangles).max() < 0.12
 
 
 def test_corridor_without_odometry_at_ten_hertz(corridor):

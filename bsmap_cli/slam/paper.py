@@ -18,6 +18,7 @@ from bsmap_cli.slam.upkeep import (
     append,
     extend,
     extents_in_map,
+    follow,
     join_lines,
     no_landmarks,
     prune,
@@ -70,11 +71,11 @@ def line_step(state: FilterState, landmarks: Landmarks, segments: Segments, step
     order = np.argsort(_bearings(segments), kind="stable").tolist()
     chosen = partial_compatibility(candidates, order, params.group_size, params.gate)
     pairs = [(int(candidates.segment[c]), int(candidates.line[c])) for c in chosen]
-    nis = 0.0
+    nis, before = 0.0, state.lines.copy()
     for segment, line in pairs:
         state, distance = filter.update(state, line, segments.parameters[segment], segments.covariances[segment])
         nis += distance
-    landmarks = extend(state, landmarks, segments, pairs, step)
+    landmarks = extend(state, follow(landmarks, before, state.lines), segments, pairs, step)
     # A segment that fits a line alone but not jointly is neither trusted nor stored a second time.
     unknown = np.setdiff1d(np.arange(len(segments.scan)), candidates.segment)
     first_new = len(landmarks.hits)

@@ -61,6 +61,15 @@ def extend(
     return Landmarks(extents, hits, last_seen)
 
 
+def follow(landmarks: Landmarks, before: Array, after: Array) -> Landmarks:
+    """Landmarks after their lines turned from `before` (m, 2) to `after`: extents stay where they are on the wall.
+
+    They are measured from the foot of the origin's normal, which slides along the line by r times the turn.
+    """
+    turn = se2.wrap(after[:, :1] - before[:, :1])
+    return landmarks._replace(extents=landmarks.extents * np.cos(turn) - before[:, 1:] * np.sin(turn))
+
+
 def append(landmarks: Landmarks, extents: Array, step: int) -> Landmarks:
     """Landmarks with new lines of extents (k, 2), seen for the first time."""
     ones = np.ones(len(extents), int)
@@ -89,7 +98,9 @@ def join_lines(
     """
     while (pair := _first_joinable(state, landmarks, touched, gate, margin, noise)) is not None:
         keep, drop = pair
+        before = state.lines.copy()
         state = constrain_equal(state, keep, drop, noise)
+        landmarks = follow(landmarks, before, state.lines)
         extents, hits, last_seen = landmarks.extents.copy(), landmarks.hits.copy(), landmarks.last_seen.copy()
         extents[keep] = min(extents[keep, 0], extents[drop, 0]), max(extents[keep, 1], extents[drop, 1])
         hits[keep] += hits[drop]

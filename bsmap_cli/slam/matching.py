@@ -156,6 +156,8 @@ def search(
 
     Each start is judged by how many of some points of the source lie near points of the target that face their way.
     """
+    if len(source.xy) == 0:
+        return [initial]  # nothing tells one place from another
     thin = slice(None, None, max(1, len(source.xy) // SEARCH_POINTS))
     points = OrientedPoints(source.xy[thin], source.normal[thin])
     step = max(SEARCH_STEP, span / SEARCH_STEPS)

@@ -10,9 +10,17 @@ from bsmap_cli.io.artifact import read_provenance
 from bsmap_cli.io.surfaces_json import read_surfaces
 
 
+@pytest.fixture(scope="module")
+def coarse(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Surfaces of few control points, quickly merged."""
+    path = tmp_path_factory.mktemp("coarse") / "log.surfaces.json"
+    assert bsmap("fit", made / "log.cloud.ply", "--bound-u", "0.2", "--bound-v", "0.5", "-o", path).code == 0
+    return path
+
+
 @pytest.fixture
-def surfaces(made: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copy(made / "log.surfaces.json", tmp_path))
+def surfaces(coarse: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copy(coarse, tmp_path))
 
 
 def test_map_lies_beside_the_surfaces_and_tells_its_decisions(surfaces):

@@ -109,7 +109,7 @@ def table(name: str, rows: np.ndarray) -> None:
 def rows_of_steps() -> None:
     """Time of both as segments grow that have several candidates each."""
     print(f"\n{'steps':>6} {'cand.':>6} {'PCA':>4} {'JCBB':>5} {'right':>6} {'PCA ms':>8} {'JCBB ms':>9}")
-    params = SlamParams()
+    params = SlamParams(method="paper")
     for count in range(4, 29, 4):
         steps = [((2.0 + 0.3 * k, 0.6 * k - 4), (2.0 + 0.3 * k, 0.6 * k - 3.5)) for k in range(count)]
         world = World([*steps, ((-3, -5), (9, -5))], (0.3, 0.05, 0.01))
@@ -168,7 +168,7 @@ def main(names):
     every = []
     for name, log in logs():
         if not names or name.split()[0] in names:
-            every.append(compare(first(log, SCANS), SlamParams()))
+            every.append(compare(first(log, SCANS), SlamParams(method="paper")))
             table(name, every[-1])
     table("all", np.concatenate(every))
     rows_of_steps()

@@ -20,6 +20,4 @@ def range_sigma(ranges: NDArray[np.floating], most: int = 200_000) -> float:
     second = second[np.isfinite(second)]
     if second.size == 0:
         return 0.01
-    # The mean of what lies below the median moves where quantisation would make the median itself jump or be 0.
-    median = float(np.median(second))
-    return max(FLOOR, median / _MEDIAN_OF_SECOND_DIFFERENCE)
+    return max(FLOOR, float(np.median(second)) / _MEDIAN_OF_SECOND_DIFFERENCE)

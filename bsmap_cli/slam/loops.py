@@ -1,6 +1,6 @@
 """Loop closing: places seen before, recognised by matching small maps of key scans, verified, smoothed over."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +10,7 @@ from bsmap_cli.core import se2
 from bsmap_cli.core.table import take
 from bsmap_cli.model import Array
 from bsmap_cli.slam import posegraph
-from bsmap_cli.slam.matching import Match, OrientedPoints, Target, make_target, match, search
+from bsmap_cli.slam.matching import Match, OrientedPoints, Target, joined, make_target, match, search
 from bsmap_cli.slam.posegraph import Edges
 from bsmap_cli.slam.tracking import Tracking, match_noise
 from bsmap_cli.track import Track
@@ -144,7 +144,7 @@ def _relocated(tracking: Tracking, poses: Array, noise: float) -> Edges:
         at = int(np.searchsorted(sound, key))
         around = sound[max(at - TARGET_KEYS, 0) : at + TARGET_KEYS]
         before, after = int(sound[max(at - 1, 0)]), int(sound[min(at, len(sound) - 1)])
-        target = make_target([look.points[j].moved(se2.between(poses[before], poses[j])) for j in around])
+        target = make_target(_small_map(look, before, around.tolist()))
         guesses = [se2.between(poses[before], poses[k]) for k in (key, after, before)]
         matches = [_register(tracking.points[key], target, guess, noise, 1.5, 0.8) for guess in guesses]
         best = max((m for m in matches if m is not None), key=lambda m: m.inliers, default=None)
@@ -201,13 +201,20 @@ def _around(centre: int, half: int, count: int) -> range:
 
 def _source(look: _Search, centre: int, keys: range) -> OrientedPoints:
     """Points of key scans in the frame of one of them, thinned."""
-    parts = [look.points[j].moved(se2.between(look.poses[centre], look.poses[j])) for j in keys]
-    thin = slice(None, None, max(1, sum(len(p.xy) for p in parts) // SOURCE_POINTS))
-    return OrientedPoints(*(np.concatenate(field)[thin] for field in zip(*parts, strict=True)))
+    points = _small_map(look, centre, keys)
+    thin = slice(None, None, max(1, len(points.xy) // SOURCE_POINTS))
+    return OrientedPoints(points.xy[thin], points.normal[thin])
 
 
 def _target(look: _Search, centre: int, keys: range) -> Target:
-    return make_target([look.points[j].moved(se2.between(look.poses[centre], look.poses[j])) for j in keys])
+    return make_target(_small_map(look, centre, keys))
+
+
+def _small_map(look: _Search, centre: int, keys: Sequence[int]) -> OrientedPoints:
+    """Points of key scans in the frame of one of them."""
+    relative = se2.between(look.poses[centre], look.poses[list(keys)])
+    poses = np.repeat(relative, [len(look.points[j].xy) for j in keys], axis=0)
+    return joined([look.points[j] for j in keys]).moved(poses)
 
 
 def _register(

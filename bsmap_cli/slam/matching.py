@@ -19,6 +19,8 @@ NORMAL_REACH = 0.12
 SEARCH_POINTS = 70
 SEARCH_STEP, SEARCH_STEPS, SEARCH_ANGLE = 0.3, 8, 0.12
 """Points looked at; steps of the grid of starts in metres and radians, wider where too many would be needed."""
+LEAST_REACH = 0.15
+"""Metres within which points pair in the end."""
 SAME_WAY = 0.7
 """Cosine of the angle between normals above which two points can be of one surface."""
 
@@ -54,9 +56,13 @@ class Match(NamedTuple):
     rms: float
 
 
-def make_target(parts: list[OrientedPoints]) -> Target:
+def joined(parts: list[OrientedPoints]) -> OrientedPoints:
+    """Points of several sets in one frame."""
+    return OrientedPoints(np.concatenate([p.xy for p in parts]), np.concatenate([p.normal for p in parts]))
+
+
+def make_target(points: OrientedPoints) -> Target:
     """Target of points given in one frame."""
-    points = OrientedPoints(np.concatenate([p.xy for p in parts]), np.concatenate([p.normal for p in parts]))
     return Target(points, cKDTree(points.xy, balanced_tree=False, compact_nodes=False))
 
 
@@ -98,6 +104,15 @@ def oriented_points(points: ScanPoints, laser_xy: Array, range_sigma: float) -> 
     return OrientedPoints(points.xy[good], normal[good]), np.flatnonzero(good)
 
 
+class _Pairs(NamedTuple):
+    """Points paired from one pose. xy, normal : (k, 2), of the source in its frame and of the target. offset : (k,)."""
+
+    pose: Array
+    xy: Array
+    normal: Array
+    offset: Array
+
+
 def match(
     source: OrientedPoints,
     target: Target,
@@ -105,7 +120,7 @@ def match(
     prior: Array,
     range_sigma: float,
     reach: float = 0.5,
-    iterations: int = 20,
+    iterations: int = 25,
 ) -> Match:
     """Best pose of `source` on `target`, Gauss-Newton from `initial` (3,).
 
@@ -114,39 +129,50 @@ def match(
     """
     pose = initial.copy()
     floor = max(2 * range_sigma, 0.05)
-    n = len(source.xy)
+    pairs = None
     for _ in range(iterations):
+        if pairs is None or _has_moved(pairs.pose, pose):
+            pairs = _pair(source, target, pose, reach)
+            if len(pairs.offset) < 5:
+                return Match(initial, np.zeros((3, 3)), 0.0, 0.0)
         c, s = np.cos(pose[2]), np.sin(pose[2])
-        R = np.array([[c, s], [-s, c]])
-        turned = source.xy @ R
-        moved = turned + pose[:2]
-        distance, nearest = nearest_points(target, moved, reach)
-        hit = np.flatnonzero(distance < reach)
-        if len(hit) < 5:
-            return Match(initial, np.zeros((3, 3)), 0.0, 0.0)
-        nearest = nearest[hit]
-        normal = target.points.normal[nearest]
-        same = np.einsum("ij,ij->i", source.normal[hit] @ R, normal) > SAME_WAY
-        hit, nearest, normal = hit[same], nearest[same], normal[same]
-        e = np.einsum("ij,ij->i", moved[hit] - target.points.xy[nearest], normal)
-        lever = turned[hit]
-        J = np.stack([normal[:, 0], normal[:, 1], normal[:, 1] * lever[:, 0] - normal[:, 0] * lever[:, 1]], axis=1)
+        nx, ny = pairs.normal.T
+        x, y = (pairs.xy @ np.array([[c, s], [-s, c]])).T
+        e = nx * (x + pose[0]) + ny * (y + pose[1]) - pairs.offset
+        J = np.stack([nx, ny, ny * x - nx * y])
         width = max(floor, reach / 4)
-        w = 1.0 / (1.0 + (e / width) ** 2)
-        wJ = J * (w / range_sigma**2)[:, None]
-        information = wJ.T @ J
+        wJ = J / ((1.0 + (e / width) ** 2) * range_sigma**2)
+        information = wJ @ J.T
         away = pose - initial
         away[2] = se2.wrap(away[2])
-        step = np.linalg.solve(information + prior, -(wJ.T @ e) - prior @ away)
+        step = np.linalg.solve(information + prior, -(wJ @ e) - prior @ away)
         pose += step
-        small = abs(step[0]) + abs(step[1]) < 1e-3 and abs(step[2]) < 5e-4
-        if small and reach <= 0.1501:
+        if reach <= LEAST_REACH and abs(step[0]) + abs(step[1]) < 1e-3 and abs(step[2]) < 5e-4:
             break
-        reach = max(0.15, reach * 0.6)
+        if reach > LEAST_REACH:
+            reach, pairs = max(LEAST_REACH, reach * 0.5), None
     on = np.abs(e) < floor
     pose[2] = se2.wrap(pose[2])
     rms = float(np.sqrt(np.mean(e[on] ** 2))) if on.any() else 0.0
-    return Match(pose, information, float(on.sum()) / max(n, 1), rms)
+    return Match(pose, information, np.count_nonzero(on) / max(len(source.xy), 1), rms)
+
+
+def _has_moved(before: Array, pose: Array) -> bool:
+    """Whether points may have other partners now than where they were paired."""
+    return bool(abs(pose[0] - before[0]) + abs(pose[1] - before[1]) > 0.01 or abs(pose[2] - before[2]) > 0.003)
+
+
+def _pair(source: OrientedPoints, target: Target, pose: Array, reach: float) -> _Pairs:
+    """Each point of the source, at `pose` (3,), with the nearest of the target that faces its way."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    R = np.array([[c, s], [-s, c]])
+    distance, nearest = nearest_points(target, source.xy @ R + pose[:2], reach)
+    hit = np.flatnonzero(distance < reach)
+    nearest = nearest[hit]
+    normal = target.points.normal[nearest]
+    same = np.einsum("ij,ij->i", source.normal[hit] @ R, normal) > SAME_WAY
+    normal, xy = normal[same], target.points.xy[nearest[same]]
+    return _Pairs(pose.copy(), source.xy[hit[same]], normal, np.einsum("ij,ij->i", xy, normal))
 
 
 def search(

@@ -14,6 +14,7 @@ from bsmap_cli.slam.matching import (
     Match,
     OrientedPoints,
     Target,
+    joined,
     make_target,
     match,
     oriented_points,
@@ -58,7 +59,8 @@ def track_scans(log: ScanLog, range_sigma: float, params: SlamParams, track: Tra
     noise = match_noise(range_sigma)
     scans = _points_of_scans(log, range_sigma)
     key_points.append(next(scans))
-    target = make_target(key_points)
+    placed = [key_points[0]]
+    target = make_target(placed[0])
     for k, points in enumerate(scans, 1):
         track("slam: tracking", k + 1, n)
         prior = _motion(log, poses, before, last, k, params)
@@ -76,7 +78,8 @@ def track_scans(log: ScanLog, range_sigma: float, params: SlamParams, track: Tra
         information.append(_edge_information(found, predicted, prior))
         keys.append(k)
         key_points.append(points)
-        target = make_target([key_points[j].moved(poses[keys[j]]) for j in _local(inliers)])
+        placed = [*placed[-WINDOW:], points.moved(poses[k])]
+        target = make_target(joined([placed[j - len(keys)] for j in _local(inliers)]))
     chain = _chain(poses[keys], information, np.array(inliers))
     return Tracking(poses, np.array(keys), key_points, chain, np.array(inliers) < WEAK)
 

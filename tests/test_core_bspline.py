@@ -117,6 +117,24 @@ def test_surface_derivatives_equal_central_differences():
         np.testing.assert_allclose(derivative, (ahead - behind) / (2 * h), atol=2e-2, rtol=1e-4)
 
 
+@pytest.mark.parametrize("degree", DEGREES)
+@pytest.mark.parametrize("narrow", [0.01, 1e-6])
+def test_polynomial_pieces_equal_basis_functions(degree, narrow):
+    """Spans are found by a table, or by a search where one is too narrow for it."""
+    rng = np.random.default_rng(degree)
+    knots_u = clamped_knots(degree, [0.25, 0.5, 0.5 + narrow])
+    knots_v = clamped_knots(2, [0.1, 0.7])
+    surface = TensorSpline(degree, 2, knots_u, knots_v, rng.standard_normal((len(knots_u) - degree - 1, 5, 3)))
+    u = np.concatenate([[0.0, 0.25, 0.5, 0.5 + narrow / 2, 0.5 + narrow, 1.0], rng.random(300)])
+    v = np.concatenate([[0.1, 0.7, 1.0, 0.0, 1.0, 1.0], rng.random(300)])
+    found = evaluate_surface(surface, u, v, 2)
+    for (order_u, order_v), values in zip(((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)), found, strict=True):
+        along_u = design_matrix(knots_u, degree, u, order_u)
+        along_v = design_matrix(knots_v, 2, v, order_v)
+        wanted = np.einsum("ni,nj,ijd->nd", along_u, along_v, surface.control_points)
+        np.testing.assert_allclose(values, wanted, atol=1e-12 * np.abs(along_u).max() * np.abs(along_v).max())
+
+
 def test_grid_equals_scattered_points():
     rng = np.random.default_rng(2)
     surface = some_surface(rng)

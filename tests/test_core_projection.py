@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 from reference import brute_force_distance
+from scipy.spatial import cKDTree
 
 from bsmap_cli.core.bspline import TensorSpline, clamped_knots, evaluate_grid, evaluate_surface, open_knots
-from bsmap_cli.core.projection import project, sample_surface
+from bsmap_cli.core.projection import project
+from bsmap_cli.core.sampling import sample_surface
 
 
 def sheet(rng, nu=12, nv=9, roughness=0.05, degree=3):
@@ -88,6 +90,29 @@ def test_nearer_sheet_of_a_fold_is_found():
     points = np.column_stack([rng.uniform(0.1, 2.7, 500), rng.uniform(0.1, 0.9, 500), rng.uniform(0.0, 0.2, 500)])
     found = project(surface, points)
     np.testing.assert_allclose(found.distance, np.minimum(points[:, 2], 0.2 - points[:, 2]), atol=1e-8)
+
+
+def test_crumpled_surface_hides_no_foot():
+    """Valleys beside each other within a cell of the control net: none farther than a descent from any dense sample."""
+    rng = np.random.default_rng(3)
+    surface = sheet(rng, roughness=0.25)
+    points = evaluate_surface(surface, *rng.random((2, 400))) + rng.normal(scale=0.02, size=(400, 3))
+    grid = evaluate_grid(surface, *[np.linspace(0, 1, 700)] * 2)
+    dense = cKDTree(grid.reshape(-1, 3)).query(points)[0]
+    assert np.all(project(surface, points).distance <= dense + 1e-9)
+
+
+def test_feet_on_a_concave_edge_are_exact():
+    """Beyond the edge v = 1 of a quarter pipe bent towards the point, where the Hessian is indefinite."""
+    s = np.sqrt(0.5)
+    arc = np.array([[1.0, 0.0], [1.0, 2 * s - 0.5], [0.5, 1.0]])
+    control = np.stack([np.stack([np.full(3, x), *arc.T], axis=1) for x in (0.0, 1.0, 2.0)])
+    surface = TensorSpline(2, 2, open_knots(2), open_knots(2), control)
+    points = np.column_stack([np.linspace(0.2, 1.8, 50), np.full(50, -0.4), np.linspace(0.9, 1.6, 50)])
+    found = project(surface, points)
+    edge = np.isclose(found.v, 1.0, atol=0.0)
+    assert edge.sum() > 10
+    np.testing.assert_allclose(found.foot[:, 0], points[:, 0], atol=1e-9)
 
 
 def test_wrong_shape_is_refused():

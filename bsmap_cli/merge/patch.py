@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bsmap_cli.core.bspline import evaluate_grid, restrict
-from bsmap_cli.core.projection import OFFSET, Samples, project, sample_surface
+from bsmap_cli.core.projection import project
+from bsmap_cli.core.sampling import OFFSET, Samples, sample_surface
 from bsmap_cli.merge.covariance import carry
 from bsmap_cli.merge.facing import Facing, visible_normals, visible_side
 from bsmap_cli.model import Array, BSplineSurface

@@ -120,5 +120,5 @@ def test_normals_point_to_the_sensor_whatever_the_parameters(turned: bool) -> No
     u, v = ((0, 0, 2.0), (4.0, 0, 0)) if not turned else ((4.0, 0, 0), (0, 0, 2.0))
     patch = make_patch(plane("a", (0.0, 2.0, 0.2), u, v, centre=(2.0, 0.0)))
     at = np.linspace(0.05, 0.95, 7)
-    normals = visible_normals(patch.surface, patch.facing, at, at)
+    normals = visible_normals(patch.samples.pieces, patch.facing, at, at)
     np.testing.assert_allclose(normals, np.tile([0.0, -1.0, 0.0], (7, 1)), atol=1e-12)

@@ -52,7 +52,7 @@ def basis_functions(
     """
     u = np.asarray(u, dtype=float)
     spans = find_spans(knots, degree, u)
-    return spans - degree, np.moveaxis(local_basis(knots, degree, spans, u, derivatives), 2, 0)
+    return spans - degree, local_basis(knots, degree, spans, u, derivatives).transpose(2, 0, 1)
 
 
 def local_basis(knots: Array, degree: int, spans: NDArray[np.intp], u: Array, derivatives: int) -> Array:
@@ -83,5 +83,5 @@ def design_matrix(knots: Array, degree: int, u: ArrayLike, derivative: int = 0) 
     """Dense matrix (n, n_control) of the basis functions at u: S(u) = N P."""
     first, values = basis_functions(knots, degree, u, derivative)
     matrix = np.zeros((len(first), len(knots) - degree - 1))
-    np.put_along_axis(matrix, first[:, None] + np.arange(degree + 1), values[:, derivative], axis=1)
+    matrix[np.arange(len(first))[:, None], first[:, None] + np.arange(degree + 1)] = values[:, derivative]
     return matrix

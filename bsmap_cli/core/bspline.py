@@ -64,7 +64,7 @@ def evaluate_surface(surface: Surface, u: ArrayLike, v: ArrayLike, derivatives: 
     u, v = np.asarray(u, dtype=float), np.asarray(v, dtype=float)
     if u.ndim != 1 or u.shape != v.shape:
         raise ValueError(f"parameters u and v have shapes {u.shape} and {v.shape}, wanted (n,) both")
-    points = np.moveaxis(evaluate_pieces(polynomial_pieces(surface), u, v, derivatives), 1, 2)
+    points = evaluate_pieces(polynomial_pieces(surface), u, v, derivatives).transpose(0, 2, 1)
     return points if derivatives else points[0]
 
 
@@ -72,5 +72,5 @@ def evaluate_grid(surface: Surface, u: ArrayLike, v: ArrayLike) -> Array:
     """Points of a surface at all pairs of parameters u (n,) and v (m,): (n, m, d)."""
     along_u = design_matrix(surface.knots_u, surface.degree_u, u)
     along_v = design_matrix(surface.knots_v, surface.degree_v, v)
-    planes = np.moveaxis(surface.control_points, 2, 0)
-    return np.moveaxis(along_u @ planes @ along_v.T, 0, 2)
+    planes = surface.control_points.transpose(2, 0, 1)
+    return (along_u @ planes @ along_v.T).transpose(1, 2, 0)

@@ -39,13 +39,14 @@ class Projection(NamedTuple):
     on_surface: NDArray[np.bool_]
 
 
-def project(surface: Surface, points: Array, samples: Samples | None = None) -> Projection:
+def project(surface: Surface, points: Array, samples: Samples | None = None, within: float = np.inf) -> Projection:
     """Nearest points of a surface, Eq. (34-36).
 
     Parameters
     ----------
     points : (n, 3), in the frame of the surface.
     samples : from `sample_surface`, where they are at hand.
+    within : metres; feet farther off are not sought to the end: they lie on the surface, but others may be nearer.
 
     Returns
     -------
@@ -58,16 +59,18 @@ def project(surface: Surface, points: Array, samples: Samples | None = None) -> 
     uv = np.empty((2, len(points)))
     for start in range(0, len(points), BATCH):
         part = slice(start, start + BATCH)
-        uv[:, part] = _nearest_feet(samples, points[part])
+        uv[:, part] = _nearest_feet(samples, points[part], within)
     return _as_projection(samples.pieces, points, uv)
 
 
-def _nearest_feet(samples: Samples, points: Array) -> Array:
+def _nearest_feet(samples: Samples, points: Array, within: float) -> Array:
     """Parameters (2, n) of the nearest feet."""
+    limit = np.full(len(points), within**2)
     columns = np.ascontiguousarray(points.T)
     near = _Near(*samples.fine.nearest(points, STARTS))
     start = _start(samples.fine, near.sample[0])
-    feet = descend(samples.pieces, columns, *start)
+    feet = descend(samples.pieces, columns, *start, limit)
+    np.minimum(feet.squared, limit, out=feet.squared)
     rows, others = _other_starts(samples.fine, near, feet)
     # All samples at hand could be under way to a nearer foot: look further, in wider steps.
     beyond = np.flatnonzero(_floor(samples.fine, near.distance[-1], near.sample[-1]) < feet.squared)

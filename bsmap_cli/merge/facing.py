@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bsmap_cli.core.bspline import Surface, evaluate_surface
+from bsmap_cli.core.pieces import Pieces, evaluate_pieces
 from bsmap_cli.model import Array, BSplineSurface
 
 SENSOR_HEIGHT = 0.5
@@ -47,20 +47,26 @@ def sensor_position(surface: BSplineSurface) -> Array:
     return np.append(shares @ centres / shares.sum(), SENSOR_HEIGHT)
 
 
-def visible_side(surface: BSplineSurface) -> Facing:
-    """Find the side of a surface that looks at its sensor."""
+def visible_side(surface: BSplineSurface, pieces: Pieces) -> Facing:
+    """Find the side of a surface that looks at its sensor; `pieces` are its own."""
     u, v = (np.arange(VOTES_U) + 0.5) / VOTES_U, (np.arange(VOTES_V) + 0.5) / VOTES_V
     grid_u, grid_v = np.meshgrid(u, v, indexing="ij")
-    S, Su, Sv = evaluate_surface(surface, grid_u.ravel(), grid_v.ravel(), 1)
+    S, Su, Sv = evaluate_pieces(pieces, grid_u.ravel(), grid_v.ravel(), 1).transpose(0, 2, 1)
     towards = sensor_position(surface) - S
     towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
     votes = np.einsum("nk,nk->n", np.cross(Su, Sv), towards).reshape(VOTES_U, VOTES_V).sum(axis=1)
     return Facing(np.where(votes < 0.0, -1.0, 1.0))
 
 
-def visible_normals(surface: Surface, facing: Facing, u: Array, v: Array) -> Array:
+def visible_normals(pieces: Pieces, facing: Facing, u: Array, v: Array) -> Array:
     """Unit normals (n, 3) on the visible side at parameters u, v (n,); zero where the surface has a pole."""
-    _, Su, Sv = evaluate_surface(surface, u, v, 1)
+    return seen_points(pieces, facing, u, v)[1]
+
+
+def seen_points(pieces: Pieces, facing: Facing, u: Array, v: Array) -> tuple[Array, Array]:
+    """Points (n, 3) of a surface and their normals as in `visible_normals`."""
+    S, Su, Sv = evaluate_pieces(pieces, u, v, 1).transpose(0, 2, 1)
     normals = np.cross(Su, Sv)
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    return facing.at(u)[:, None] * np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 1e-12)
+    normals = facing.at(u)[:, None] * np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 1e-12)
+    return S, normals

@@ -83,7 +83,7 @@ def pair_samples(first: Patch, second: Patch, distance: float) -> Pairing:
     v = _parameters(first.surface.knots_v, first.surface.degree_v, first.size[1])
     points = evaluate_grid(first.surface, u, v)
     grid_u, grid_v = np.meshgrid(u, v, indexing="ij")
-    sides = visible_normals(first.surface, first.facing, grid_u.ravel(), grid_v.ravel())
+    sides = visible_normals(first.samples.pieces, first.facing, grid_u.ravel(), grid_v.ravel())
     landing = land(points.reshape(-1, 3), sides, second, distance)
     hit, normals = landing.hit, landing.normal[landing.hit]
     S, T = points.reshape(-1, 3)[hit], landing.foot[hit]

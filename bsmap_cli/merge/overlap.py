@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bsmap_cli.core.bspline import evaluate_grid, evaluate_surface
-from bsmap_cli.merge.facing import visible_normals
+from bsmap_cli.core.bspline import evaluate_grid
+from bsmap_cli.merge.facing import seen_points
 from bsmap_cli.merge.patch import Landing, Patch, Window, land, width
 from bsmap_cli.model import Array
 
@@ -62,8 +62,7 @@ def outline(first: Patch, second: Patch, distance: float) -> Outline:
 
 def land_parameters(patch: Patch, u: Array, v: Array, target: Patch, distance: float) -> Landing:
     """Land the points of a patch at parameters u, v (n,) on another."""
-    points = evaluate_surface(patch.surface, u, v)
-    return land(points, visible_normals(patch.surface, patch.facing, u, v), target, distance)
+    return land(*seen_points(patch.samples.pieces, patch.facing, u, v), target, distance)
 
 
 def _boundary(patch: Patch, step: float) -> Array:

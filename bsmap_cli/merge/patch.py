@@ -65,7 +65,7 @@ class Landing(NamedTuple):
 def make_patch(surface: BSplineSurface, facing: Facing | None = None, root: str = "") -> Patch:
     """Patch of a surface; without `facing` its visible side is found from its data sets' centres."""
     samples = sample_surface(surface)
-    facing = visible_side(surface) if facing is None else facing
+    facing = visible_side(surface, samples.pieces) if facing is None else facing
     corners = surface.control_points.reshape(-1, 3)
     box = np.stack([corners.min(axis=0), corners.max(axis=0)])
     return Patch(surface, facing, root or surface.name, samples, box, _size(surface))
@@ -102,19 +102,27 @@ def land(points: Array, normals: Array, target: Patch, distance: float) -> Landi
     n = len(points)
     u, v, foot, normal = np.zeros(n), np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3))
     on, same = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
-    grid = target.samples.fine
-    gap, nearest = grid.tree.query(points, distance_upper_bound=distance + float(grid.reach.max()))
-    # A foot lies beside the sample that is nearest to it, at most by a share of the cell.
-    close = np.flatnonzero(np.asarray(gap) <= np.hypot(distance, OFFSET * np.append(grid.reach, 0.0)[nearest]))
+    close = _near(points, target, distance)
     if len(close):
-        found = project(target.surface, points[close], target.samples)
+        found = project(target.surface, points[close], target.samples, distance)
         u[close], v[close], foot[close] = found.u, found.v, found.foot
-        normal[close] = visible_normals(target.surface, target.facing, found.u, found.v)
+        normal[close] = visible_normals(target.samples.pieces, target.facing, found.u, found.v)
         r = points[close] - found.foot
         aside = np.linalg.norm(r - np.einsum("nk,nk->n", r, normal[close])[:, None] * normal[close], axis=1)
         on[close] = (found.distance <= distance) & (found.on_surface | (aside <= OVERHANG))
         same[close] = np.einsum("nk,nk->n", normals[close], normal[close]) >= 0.0
     return Landing(u, v, foot, normal, on & same, on & ~same)
+
+
+def _near(points: Array, target: Patch, distance: float) -> NDArray[np.intp]:
+    """Numbers of the points (n, 3) that can have a foot within `distance`: by the patch's box, then by its samples."""
+    inside = np.flatnonzero(np.all((points >= target.box[0] - distance) & (points <= target.box[1] + distance), axis=1))
+    if not len(inside):
+        return inside
+    grid = target.samples.fine
+    gap, nearest = grid.tree.query(points[inside], distance_upper_bound=distance + float(grid.reach.max()))
+    # A foot lies beside the sample that is nearest to it, at most by a share of the cell.
+    return inside[np.asarray(gap) <= np.hypot(distance, OFFSET * np.append(grid.reach, 0.0)[nearest])]
 
 
 def cut(patch: Patch, window: Window, name: str) -> Patch:

@@ -33,6 +33,8 @@ SOURCE_KEYS, TARGET_KEYS = 5, 10
 SOURCE_POINTS = 250
 CLOSURE_FLOOR = (0.02, 0.02, 0.005)
 """Standard deviations of a closure beside that of the match: metres, metres, radians."""
+BOLD, SUPPORT_WAY = (0.5, 0.1), 10.0
+"""A closure that moves the trajectory by more metres or radians needs another one, so many metres of way off."""
 WRONG = 25.0
 """Squared Mahalanobis distance beyond which a closure contradicts all the others."""
 
@@ -59,14 +61,16 @@ def close_loops(tracking: Tracking, range_sigma: float, track: Track) -> Closure
     poses = tracking.poses[tracking.keys]
     way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
     noise = match_noise(range_sigma)
-    closures, tried = _no_edges(), set[tuple[int, int]]()
+    closures, failed = _no_edges(), dict[tuple[int, int], Array]()
     chain = _relinked(tracking, noise)
     if tracking.weak.any():
         poses = posegraph.optimise(poses, chain).poses
     wide = False
     for k in range(ROUNDS):
         track("slam: loops", k, ROUNDS)
-        found = _find(_Search(tracking.points, poses, way, noise), tried, _far_from(closures, way) if wide else None)
+        look = _Search(tracking.points, poses, way, noise)
+        found = _find(look, closures, failed, _far_from(closures, way) if wide else None)
+        found = take(found, _supported(look, found))
         if len(found.first) == 0:
             if wide:
                 break
@@ -74,7 +78,6 @@ def close_loops(tracking: Tracking, range_sigma: float, track: Track) -> Closure
             wide = True
             continue
         wide = False
-        tried |= set(zip(found.first.tolist(), found.second.tolist(), strict=True))
         closures = posegraph.concatenate([closures, found])
         poses = posegraph.optimise(poses, posegraph.concatenate([chain, closures])).poses
     holds = _holding(poses, closures)
@@ -153,24 +156,58 @@ def _relocated(tracking: Tracking, poses: Array, noise: float) -> Edges:
     return posegraph.concatenate(found)
 
 
-def _find(look: _Search, tried: set[tuple[int, int]], wide: NDArray[np.bool_] | None = None) -> Edges:
+def _find(
+    look: _Search, closures: Edges, failed: dict[tuple[int, int], Array], wide: NDArray[np.bool_] | None = None
+) -> Edges:
     """Closures between places that are near each other by the poses as they are.
 
+    closures : found before; the same visit is not closed twice.  failed : guesses from which a match failed; they are
+    not tried again, and new ones are added.
     wide : (n,) key scans for which, and only for them, a wider search is made where the match from there fails.
     """
     found, targets = [_no_edges()], dict[int, Target]()
+    known = set(zip(closures.second.tolist(), (closures.first // TARGET_KEYS).tolist(), strict=True))
     for here, before in _candidates(look, SPACING if wide is None else WIDE_SPACING):
-        if (before, here) in tried or (wide is not None and not wide[here]):
+        visit = before // TARGET_KEYS
+        if known & {(here, visit - 1), (here, visit), (here, visit + 1)} or (wide is not None and not wide[here]):
+            continue
+        guess = se2.between(look.poses[before], look.poses[here])
+        if wide is None and (before, here) in failed and _alike(guess, failed[before, here]):
             continue
         if before not in targets:
             targets[before] = _target(look, before, _around(before, TARGET_KEYS, len(look.poses)))
         source = _source(look, here, _around(here, SOURCE_KEYS, len(look.poses)))
-        guess = se2.between(look.poses[before], look.poses[here])
         span = float(_reach(look.way[here] - look.way[before]))
         closure = _register(source, targets[before], guess, look.noise, span, 0.0 if wide is None else WIDE_TURN)
-        if closure is not None:
+        if closure is None:
+            failed[before, here] = guess
+        else:
             found.append(_closure(before, here, closure))
     return posegraph.concatenate(found)
+
+
+def _alike(a: Array, b: Array) -> bool:
+    """Whether two guesses lead a match to the same place."""
+    return bool(np.hypot(a[0] - b[0], a[1] - b[1]) < 0.2 and abs(se2.wrap(a[2] - b[2])) < 0.05)
+
+
+def _supported(look: _Search, found: Edges) -> NDArray[np.bool_]:
+    """(m,) closures that move little, or that another one, from a place near by, agrees with.
+
+    One place that looks like another is a matter of chance; several in a row that are moved alike are not.
+    """
+    error, _, _ = posegraph.residuals(look.poses, found)
+    bold = (np.hypot(error[:, 0], error[:, 1]) > BOLD[0]) | (np.abs(error[:, 2]) > BOLD[1])
+    moved = se2.compose(look.poses[found.first], found.relative)  # where the closure puts its second key scan
+    out = ~bold
+    for k in np.flatnonzero(bold):
+        way = np.abs(look.way[found.second] - look.way[found.second[k]])
+        near = np.flatnonzero((way > 0) & (way < SUPPORT_WAY))
+        # Where this closure would put the other one's key scan, by the trajectory between the two.
+        there = se2.compose(moved[k], se2.between(look.poses[found.second[k]], look.poses[found.second[near]]))
+        apart = se2.between(there, moved[near])
+        out[k] = bool(np.any((np.hypot(apart[:, 0], apart[:, 1]) < BOLD[0]) & (np.abs(apart[:, 2]) < BOLD[1])))
+    return out
 
 
 def _reach(way: Array) -> Array:

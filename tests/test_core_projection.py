@@ -102,6 +102,17 @@ def test_crumpled_surface_hides_no_foot():
     assert np.all(project(surface, points).distance <= dense + 1e-9)
 
 
+def test_limit_changes_no_foot_within_it():
+    rng = np.random.default_rng(4)
+    surface = sheet(rng, roughness=0.1)
+    points = evaluate_surface(surface, *rng.random((2, 2000))) + rng.normal(scale=0.1, size=(2000, 3))
+    whole, limited = project(surface, points), project(surface, points, within=0.1)
+    near = whole.distance <= 0.1
+    assert 0.2 < near.mean() < 0.8
+    np.testing.assert_allclose(limited.foot[near], whole.foot[near], atol=1e-8)
+    assert np.all(limited.distance[~near] > 0.1)
+
+
 def test_feet_on_a_concave_edge_are_exact():
     """Beyond the edge v = 0 of a quarter pipe and beyond its axis: the Hessian is indefinite, across the edge only."""
     arc = np.array([[1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])

@@ -19,8 +19,8 @@ EDGE_TOLERANCE = 1e-6
 """Metres that a point may overhang an edge of the surface and still count as on it."""
 LONGEST_STEP = 1.0
 """Step at a time in diagonals of the cells at the start: longer ones leave its valley."""
-STARTS = 8
-"""Samples looked at for other starts."""
+STARTS, MORE_STARTS = 8, 24
+"""Samples looked at for other starts, and where the last of them may lead to a nearer foot, too."""
 BATCH = 16384
 """Points projected at a time."""
 
@@ -71,14 +71,7 @@ def _nearest_feet(samples: Samples, points: Array, within: float) -> Array:
     start = _start(samples.fine, near.sample[0])
     feet = descend(samples.pieces, columns, *start, limit)
     np.minimum(feet.squared, limit, out=feet.squared)
-    rows, others = _other_starts(samples.fine, near, feet)
-    # All samples at hand could be under way to a nearer foot: look further, in wider steps.
-    beyond = np.flatnonzero(_floor(samples.fine, near.distance[-1], near.sample[-1]) < feet.squared)
-    if len(beyond):
-        further = _Near(*samples.coarse.nearest(points[beyond], STARTS))
-        more, starts = _other_starts(samples.coarse, further, Feet(feet.uv[:, beyond], feet.squared[beyond]))
-        rows = np.concatenate([rows, beyond[more]])
-        others = _Start._make(np.concatenate(pair, axis=-1) for pair in zip(others, starts, strict=True))
+    rows, others = _all_other_starts(samples, points, near, feet)
     if len(rows):
         _keep_nearest(feet, rows, descend(samples.pieces, columns[:, rows], *others, feet.squared[rows]))
     return feet.uv
@@ -105,6 +98,24 @@ def _start(grid: SampleGrid, index: NDArray[np.intp]) -> _Start:
 def _floor(grid: SampleGrid, distance: Array, index: NDArray[np.intp]) -> Array:
     """Squared distance of the nearest foot that samples may lie above, an offset beside them."""
     return distance**2 - (OFFSET * grid.reach.take(index)) ** 2
+
+
+def _all_other_starts(samples: Samples, points: Array, near: _Near, feet: Feet) -> tuple[NDArray[np.intp], _Start]:
+    """Points (k,) and other starts for them among the samples at hand (`near`), and further ones where those end."""
+    rows, starts = _other_starts(samples.fine, near, feet)
+    found = [(rows, *starts)]
+    # Where the last sample at hand could still lie above a nearer foot: more samples, then wider steps.
+    left = np.flatnonzero(_floor(samples.fine, near.distance[-1], near.sample[-1]) < feet.squared)
+    for grid, known, count in ((samples.fine, STARTS, MORE_STARTS), (samples.coarse, 0, STARTS)):
+        if not len(left):
+            break
+        near = _Near._make(ranks[known:] for ranks in grid.nearest(points[left], count))
+        here = Feet(feet.uv[:, left], feet.squared[left])
+        rows, starts = _other_starts(grid, near, here)
+        found.append((left[rows], *starts))
+        left = left[_floor(grid, near.distance[-1], near.sample[-1]) < here.squared]
+    rows, uv, longest = (np.concatenate(parts, axis=-1) for parts in zip(*found, strict=True))
+    return rows, _Start(uv, longest)
 
 
 def _other_starts(grid: SampleGrid, near: _Near, feet: Feet) -> tuple[NDArray[np.intp], _Start]:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bsmap_cli.core.bspline import evaluate_grid, restrict
+from bsmap_cli.core.bspline import design_matrix, restrict
 from bsmap_cli.core.projection import project
 from bsmap_cli.core.sampling import OFFSET, Samples, sample_surface
 from bsmap_cli.merge.covariance import carry
@@ -15,6 +15,8 @@ from bsmap_cli.model import Array, BSplineSurface
 
 OVERHANG = 0.02
 """Metres a point may lie outside a patch's edge and still count as on it: edges of patches are known no better."""
+EVENLY = np.linspace(0.0, 1.0, 33)
+"""Parameters across which lengths are means."""
 
 
 class Window(NamedTuple):
@@ -36,6 +38,7 @@ class Patch:
     box : (2, 3) lowest and highest coordinates of the control points; they enclose the surface.
     size : lengths along u and v in metres, means over the other direction.
     root : name of the surfaces of which it is a piece.
+    lines : control points of curves spread evenly over the other direction, along u (nu, k, 3) and along v (nv, k, 3).
     """
 
     surface: BSplineSurface
@@ -44,6 +47,7 @@ class Patch:
     samples: Samples
     box: Array
     size: tuple[float, float]
+    lines: tuple[Array, Array]
 
 
 class Landing(NamedTuple):
@@ -68,27 +72,31 @@ def make_patch(surface: BSplineSurface, facing: Facing | None = None, root: str 
     facing = visible_side(surface, samples.pieces) if facing is None else facing
     corners = surface.control_points.reshape(-1, 3)
     box = np.stack([corners.min(axis=0), corners.max(axis=0)])
-    return Patch(surface, facing, root or surface.name, samples, box, _size(surface))
+    lines = _lines(surface)
+    size = _line_length(surface, lines, 0, EVENLY), _line_length(surface, lines, 1, EVENLY)
+    return Patch(surface, facing, root or surface.name, samples, box, size, lines)
 
 
-def _size(surface: BSplineSurface) -> tuple[float, float]:
-    points = evaluate_grid(surface, np.linspace(0.0, 1.0, 33), np.linspace(0.0, 1.0, 33))
-    return float(_lengths(points, 0).sum()), float(_lengths(points, 1).sum())
+def _lines(surface: BSplineSurface) -> tuple[Array, Array]:
+    at_u = design_matrix(surface.knots_u, surface.degree_u, EVENLY)
+    at_v = design_matrix(surface.knots_v, surface.degree_v, EVENLY)
+    return at_v @ surface.control_points, np.tensordot(surface.control_points, at_u, (0, 1)).transpose(0, 2, 1)
 
 
-def _lengths(points: Array, axis: int) -> Array:
-    """Mean lengths of the steps of a grid of points (n, m, 3) along an axis."""
-    steps: Array = np.linalg.norm(np.diff(points, axis=axis), axis=2)
-    return steps.mean(axis=1 - axis)
+def _line_length(surface: BSplineSurface, lines: tuple[Array, Array], axis: int, along: Array) -> float:
+    """Mean length of the lines along an axis (0: u, 1: v), through the parameters `along` (n,)."""
+    knots, degree = ((surface.knots_u, surface.degree_u), (surface.knots_v, surface.degree_v))[axis]
+    n, k, _ = lines[axis].shape
+    points = (design_matrix(knots, degree, along) @ lines[axis].reshape(n, -1)).reshape(-1, k, 3)
+    steps = np.diff(points, axis=0)
+    return float(np.sqrt(np.einsum("nkd,nkd->nk", steps, steps)).sum() / k)
 
 
 def width(patch: Patch, axis: int, a: float, b: float) -> float:
     """Mean length in metres of the strip from parameter a to b along an axis (0: u, 1: v)."""
     if b <= a:
         return 0.0
-    across, along = np.linspace(0.0, 1.0, 33), np.linspace(a, b, 17)
-    u, v = (along, across) if axis == 0 else (across, along)
-    return float(_lengths(evaluate_grid(patch.surface, u, v), axis).sum())
+    return _line_length(patch.surface, patch.lines, axis, np.linspace(a, b, 17))
 
 
 def land(points: Array, normals: Array, target: Patch, distance: float) -> Landing:

@@ -110,6 +110,13 @@ class LineMap:
         _check(self, parameters=(m, 2), covariances=(m, 2, 2), extents=(m, 2), sides=(m,), hits=(m,))
 
 
+def segment_ends(lines: LineMap) -> Array:
+    """(m, 2, 2) both end points of each segment, in map."""
+    alpha, r = lines.parameters.T
+    n, t = np.stack([np.cos(alpha), np.sin(alpha)], -1), np.stack([-np.sin(alpha), np.cos(alpha)], -1)
+    return (n * r[:, None])[:, None] + t[:, None] * lines.extents[..., None]
+
+
 @dataclass(frozen=True)
 class StepStatistics:
     """What each step of the filter did (the paper's Figure 11), one row a horizontal scan.
@@ -130,8 +137,34 @@ class StepStatistics:
 
 
 @dataclass(frozen=True)
+class LoopClosures:
+    """Pairs of horizontal scans that were matched with each other because the robot seemed to be there again.
+
+    first, second : (m,) numbers of the scans.  relative : (m, 3) pose of base_link at the second scan in its frame at
+    the first one, as measured.  held : (m,) whether the trajectory follows it; False where it was refused.
+    """
+
+    first: IntArray
+    second: IntArray
+    relative: Array
+    held: NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        m = len(self.first)
+        _check(self, first=(m,), second=(m,), relative=(m, 3), held=(m,))
+
+
+def no_closures() -> LoopClosures:
+    """No loops at all."""
+    return LoopClosures(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0, bool))
+
+
+@dataclass(frozen=True)
 class SlamMap:
-    """Trajectory at the horizontal scans, line map, statistics; the vertical scans are carried on for the cloud."""
+    """Trajectory at the horizontal scans, line map, statistics; the vertical scans are carried on for the cloud.
+
+    tracked_poses : (n, 3) of base_link in map, before loops were closed and all was smoothed; None where nothing was.
+    """
 
     trajectory: Trajectory
     lines: LineMap
@@ -139,6 +172,12 @@ class SlamMap:
     vertical: LaserScans | None
     horizontal_mount: Array
     horizontal_frame_id: str = "laser_horizontal"
+    closures: LoopClosures = field(default_factory=no_closures)
+    tracked_poses: Array | None = None
+
+    def __post_init__(self) -> None:
+        if self.tracked_poses is not None:
+            _check(self, tracked_poses=(len(self.trajectory.time_ns), 3))
 
 
 @dataclass(frozen=True)

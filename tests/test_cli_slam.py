@@ -66,6 +66,43 @@ def test_what_it_refuses(log, tmp_path):
     assert_usual_refusals("slam", log, tmp_path)
 
 
+@pytest.mark.parametrize("ending", [".png", ".svg", ".pdf"])
+def test_picture_is_the_same_when_made_at_once_and_from_the_artifact(log, ending):
+    one, two = log.with_name("one" + ending), log.with_name("two" + ending)
+    done = bsmap("slam", log, "--plot", one)
+    assert f"{one}: picture" in done.err
+    made = read_provenance(log.with_name("log.slam.mcap"))
+    done = bsmap("slam", log, "--plot", two)
+    assert "up to date" in done.err
+    assert read_provenance(log.with_name("log.slam.mcap")) == made
+    assert one.read_bytes() == two.read_bytes()
+    magic = {".png": b"\x89PNG", ".svg": b"<?xml", ".pdf": b"%PDF"}[ending]
+    assert one.read_bytes().startswith(magic)
+    assert left_over(log.parent) == []
+
+
+def test_several_pictures_at_once_and_with_the_papers_filter(log):
+    pictures = [log.with_name("a.png"), log.with_name("b.svg")]
+    assert bsmap("slam", log, "--method", "paper", "--plot", pictures[0], "--plot", pictures[1]).code == 0
+    assert all(path.stat().st_size > 10_000 for path in pictures)
+
+
+def test_picture_that_cannot_be_made_is_refused_before_the_work(log):
+    slam = log.with_name("log.slam.mcap")
+    assert_refused(bsmap("slam", log, "--plot", log.with_name("a.gif")), 2, "a.gif: pictures are made as .png")
+    assert_refused(bsmap("slam", log, "--plot", log.parent / "none" / "a.png"), 73, "there is no folder")
+    twice = log.with_name("a.png")
+    assert_refused(bsmap("slam", log, "--plot", twice, "--plot", twice), 2, "is the name of two outputs")
+    assert not slam.exists()
+
+
+def test_loops_are_told_and_stand_in_the_artifact(log):
+    done = bsmap("slam", log)
+    assert "loops closed 0, loops refused 0" in done.err
+    assert read_provenance(log.with_name("log.slam.mcap")).figures["loops_closed"] == 0
+    assert "loops_refused: 0" in bsmap("info", log.with_name("log.slam.mcap")).out
+
+
 def test_values_that_make_no_sense_are_refused_with_the_limit(log):
     assert_refused(bsmap("slam", log, "--min-length", "-1"), 2, "min_length: -1.0 is outside [0.01, None]")
     assert_refused(bsmap("slam", log, "--angle-sigma", "10"), 2, "10 is beyond the limit of 5.7")

@@ -13,7 +13,7 @@ from bsmap_cli.io.artifact import Provenance, read_provenance
 from bsmap_cli.io.completeness import is_complete
 from bsmap_cli.io.mcap_file import read_messages, ros_writer
 from bsmap_cli.io.slam_mcap import read_slam, write_slam
-from bsmap_cli.model import LaserScans, LineMap, SlamMap, StepStatistics, Trajectory
+from bsmap_cli.model import LaserScans, LineMap, LoopClosures, SlamMap, StepStatistics, Trajectory, no_closures
 
 START = 1_700_000_000_123_456_789
 
@@ -39,6 +39,10 @@ def slam_map(n: int = 25, m: int = 6, beams: int = 40) -> SlamMap:
         StepStatistics(counts[0], counts[1], counts[2], rng.chisquare(3, n), counts[3]),
         LaserScans(times[1:] - 7, ranges, -2.3, 1 / 3, 1e-5, 0.1, 30.0, mount, "laser_vertical", "/scan_vertical"),
         np.eye(4),
+        closures=LoopClosures(
+            np.array([0, 3, 1]), np.array([20, 21, 24]), rng.normal(size=(3, 3)), np.array([True, False, True])
+        ),
+        tracked_poses=rng.normal(size=(n, 3)) * 5,
     )  # fmt: skip
 
 
@@ -61,7 +65,7 @@ def test_slam_map_comes_back_to_the_last_bit(tmp_path: Path) -> None:
 
 
 def test_slam_map_without_vertical_laser_and_lines(tmp_path: Path) -> None:
-    slam = replace(slam_map(m=0), vertical=None)
+    slam = replace(slam_map(m=0), vertical=None, closures=no_closures(), tracked_poses=None)
     write_slam(tmp_path / "a.slam.mcap", slam)
     assert_same(read_slam(tmp_path / "a.slam.mcap"), slam)
 
@@ -93,7 +97,8 @@ def test_viewers_find_standard_messages(tmp_path: Path) -> None:
         messages.setdefault(message.topic, []).append(ros.decode(message.data, message.type_name))
     counts = {topic: len(values) for topic, values in messages.items()}
     assert counts == {
-        "/tf_static": 1, "/bsmap/slam": 1, "/map/segments": 1, "/trajectory": 1,
+        "/tf_static": 1, "/bsmap/slam": 1, "/map/segments": 1, "/map/closures": 1,
+        "/trajectory": 1, "/trajectory_tracked": 1, "/bsmap/tracked": 1,
         "/pose": 25, "/tf": 25, "/bsmap/steps": 25, "/scan_vertical": 24,
     }  # fmt: skip
     assert {t.child_frame_id for t in messages["/tf_static"][0].transforms} == {"laser_horizontal", "laser_vertical"}
@@ -108,6 +113,26 @@ def test_viewers_find_standard_messages(tmp_path: Path) -> None:
     alpha, r = np.repeat(slam.lines.parameters, 2, axis=0).T
     np.testing.assert_allclose(points[:, 0] * np.cos(alpha) + points[:, 1] * np.sin(alpha), r, atol=1e-14)
     np.testing.assert_allclose(points[:, 1] * np.cos(alpha) - points[:, 0] * np.sin(alpha), slam.lines.extents.ravel())
+
+
+def test_viewers_are_shown_the_loops_and_the_way_before_they_were_closed(tmp_path: Path) -> None:
+    slam = slam_map()
+    write_slam(tmp_path / "a.slam.mcap", slam)
+    decoded = {m.topic: ros.decode(m.data, m.type_name) for m in read_messages(tmp_path / "a.slam.mcap")}
+    marker = decoded["/map/closures"].markers[0]
+    assert marker.type == 5  # LINE_LIST
+    ends = np.array([(p.x, p.y) for p in marker.points]).reshape(-1, 2, 2)
+    np.testing.assert_array_equal(ends[:, 0], slam.trajectory.poses[slam.closures.first, :2])
+    np.testing.assert_array_equal(ends[:, 1], slam.trajectory.poses[slam.closures.second, :2])
+    assert [c.g > c.r for c in marker.colors[::2]] == slam.closures.held.tolist()
+    before = [ros.planar_pose(p.pose)[:2] for p in decoded["/trajectory_tracked"].poses]
+    np.testing.assert_allclose(before, slam.tracked_poses[:, :2])
+
+
+def test_without_lines_and_loops_viewers_get_no_empty_marker(tmp_path: Path) -> None:
+    write_slam(tmp_path / "a.slam.mcap", replace(slam_map(m=0), closures=no_closures()))
+    decoded = {m.topic: ros.decode(m.data, m.type_name) for m in read_messages(tmp_path / "a.slam.mcap")}
+    assert decoded["/map/segments"].markers == decoded["/map/closures"].markers == []
 
 
 def test_cut_artifact_is_refused_not_used_in_part(tmp_path: Path) -> None:
@@ -137,5 +162,5 @@ def test_a_log_is_not_a_slam_map(tmp_path: Path) -> None:
 def test_another_version_is_refused(tmp_path: Path) -> None:
     with ros_writer(tmp_path / "a.mcap") as writer:
         writer.write("/bsmap/slam", ros.make("std_msgs/msg/String", data='{"format":"bsmap-slam","version":99}'), 0)
-    with pytest.raises(BadInputError, match="is of version 99, this bsmap reads 1"):
+    with pytest.raises(BadInputError, match="is of version 99, this bsmap reads 2"):
         read_slam(tmp_path / "a.mcap")

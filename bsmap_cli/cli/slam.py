@@ -1,11 +1,13 @@
 """bsmap slam: a robot's log -> trajectory and line map."""
 
 from pathlib import Path
+from typing import Any
 
 import click
 
-from bsmap_cli.cli.options import force_option, input_argument, output_option, parameters
-from bsmap_cli.cli.stage import Result, beside, run_stage
+from bsmap_cli.cli.options import force_option, input_argument, output_option, parameters, say
+from bsmap_cli.cli.stage import Result, beside, check_outputs, run_stage
+from bsmap_cli.errors import ParameterError
 from bsmap_cli.params import LogParams, SlamParams
 from bsmap_cli.track import Track
 
@@ -14,10 +16,25 @@ from bsmap_cli.track import Track
 @input_argument("LOG")
 @output_option
 @parameters(LogParams, SlamParams)
+@click.option(
+    "--plot", "plots", type=click.Path(path_type=Path), multiple=True, metavar="FILE",
+    help="Picture of the result: PNG, SVG or PDF by its ending. May be given several times.",
+)  # fmt: skip
 @force_option
-def slam(log: Path, output: Path | None, log_params: LogParams, slam_params: SlamParams, force: bool) -> None:
+def slam(
+    log: Path,
+    output: Path | None,
+    log_params: LogParams,
+    slam_params: SlamParams,
+    plots: tuple[Path, ...],
+    force: bool,
+) -> None:
     """Trajectory and line map from the horizontal laser: LOG.slam.mcap and LOG.tum."""
-    make_slam_file(log, output or beside(log, ".slam.mcap", [".mcap"]), log_params, slam_params, force)
+    output = output or beside(log, ".slam.mcap", [".mcap"])
+    _check_plots(plots, [log, output, _tum_of(output)])
+    make_slam_file(log, output, log_params, slam_params, force)
+    if plots:
+        _draw(output, plots)
 
 
 def make_slam_file(log: Path, output: Path, log_params: LogParams, slam_params: SlamParams, force: bool) -> None:
@@ -30,20 +47,49 @@ def make_slam_file(log: Path, output: Path, log_params: LogParams, slam_params: 
         from bsmap_cli.slam import run_slam
 
         result = run_slam(read_log(log, log_params), slam_params, track=track)
-        statistics, trajectory = result.statistics, result.trajectory
-        figures = {
-            "scans": len(trajectory.time_ns),
-            "lines": len(result.lines.hits),
-            "matched_per_scan": float(statistics.matched.mean()),
-            "innovation_consistency": float(statistics.nis.sum() / max(int(statistics.dof.sum()), 1)),
-        }
         return Result(
             [
                 lambda path, provenance: write_slam(path, result, provenance),
-                lambda path, provenance: write_tum(path, trajectory, provenance),
+                lambda path, provenance: write_tum(path, result.trajectory, provenance),
             ],
-            figures,
+            _figures(result),
         )
 
-    tum = beside(output, ".tum", [".slam.mcap", ".mcap"])
-    run_stage("slam", [log], [output, tum], [log_params, slam_params], compute, force)
+    run_stage("slam", [log], [output, _tum_of(output)], [log_params, slam_params], compute, force)
+
+
+def _tum_of(output: Path) -> Path:
+    return beside(output, ".tum", [".slam.mcap", ".mcap"])
+
+
+def _figures(result: Any) -> dict[str, Any]:
+    """Figures of a model.SlamMap for the report."""
+    statistics, held = result.statistics, result.closures.held
+    return {
+        "scans": len(result.trajectory.time_ns),
+        "lines": len(result.lines.hits),
+        "matched_per_scan": float(statistics.matched.sum() / max(int((statistics.new > 0).sum()), 1)),
+        "innovation_consistency": float(statistics.nis.sum() / max(int(statistics.dof.sum()), 1)),
+        "loops_closed": int(held.sum()),
+        "loops_refused": int((~held).sum()),
+    }
+
+
+def _check_plots(plots: tuple[Path, ...], taken: list[Path]) -> None:
+    """Before any work: each is of a format known, and takes no other file's place."""
+    for path in plots:
+        if path.suffix.lower() not in (".png", ".svg", ".pdf"):
+            raise ParameterError(f"{path}: pictures are made as .png, .svg and .pdf")
+    check_outputs(taken, plots)
+
+
+def _draw(output: Path, plots: tuple[Path, ...]) -> None:
+    from bsmap_cli.io.artifact import atomic_output
+    from bsmap_cli.io.slam_mcap import read_slam
+    from bsmap_cli.picture import draw_slam
+
+    result = read_slam(output)
+    for plot in plots:
+        with atomic_output(plot) as path:
+            draw_slam(path, plot.suffix.lower(), result, output.name.removesuffix(".slam.mcap"))
+        say(f"{plot}: picture")

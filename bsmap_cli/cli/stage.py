@@ -35,7 +35,7 @@ def run_stage(
 
     for path in inputs:
         existing(path)
-    _check_outputs(inputs, outputs)
+    check_outputs(inputs, outputs)
     provenance = artifact.make_provenance(stage, artifact.plain_parameters(*params), inputs)
     if not force and all(artifact.is_up_to_date(path, provenance.fingerprint) for path in outputs):
         for path in outputs:
@@ -53,13 +53,13 @@ def run_stage(
     say(f"{', '.join(map(str, outputs))}: {figures}")
 
 
-def _check_outputs(inputs: Sequence[Path], outputs: Sequence[Path]) -> None:
+def check_outputs(inputs: Sequence[Path], outputs: Sequence[Path]) -> None:
     """Before any work: outputs must not be inputs or one file, and their folders must be there."""
     for k, path in enumerate(outputs):
         if any(path.resolve() == other.resolve() for other in inputs):
-            raise ParameterError(f"{path}: is the input; name another output with -o")
+            raise ParameterError(f"{path}: is the input; name another output")
         if any(path.resolve() == other.resolve() for other in outputs[:k]):
-            raise ParameterError(f"{path}: is the name of two outputs; name another one with -o")
+            raise ParameterError(f"{path}: is the name of two outputs; name another one")
         if not path.parent.is_dir():
             raise CannotWriteError(f"{path}: there is no folder {path.parent}")
         if path.is_dir():

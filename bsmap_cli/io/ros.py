@@ -19,6 +19,8 @@ TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 PATH = "nav_msgs/msg/Path"
 MARKER_ARRAY = "visualization_msgs/msg/MarkerArray"
+STRING = "std_msgs/msg/String"
+NUMBERS = "std_msgs/msg/Float64MultiArray"
 
 NANOSECONDS = 1_000_000_000
 # Rows and columns of x, y, theta in the 6 x 6 covariance of a ROS pose (x, y, z, roll, pitch, yaw).
@@ -181,3 +183,44 @@ def scan_of(scans: LaserScans, time_ns: int, ranges: NDArray[np.float32]) -> Any
         ranges=np.where(np.isnan(ranges), np.float32(np.inf), ranges).astype(np.float32),
         intensities=np.zeros(0, np.float32),
     )
+
+
+def numbers_message(rows: Array, label: str) -> Any:
+    """std_msgs/Float64MultiArray of an array (..., k); `label` names the k columns."""
+    dimension = make("std_msgs/msg/MultiArrayDimension", label=label, size=rows.shape[-1], stride=rows.shape[-1])
+    layout = make("std_msgs/msg/MultiArrayLayout", dim=[dimension], data_offset=0)
+    return make(NUMBERS, layout=layout, data=rows.ravel())
+
+
+def line_list_message(name: str, ends: Array, colors: ArrayLike, width: float, height: float, time_ns: int) -> Any:
+    """visualization_msgs/MarkerArray of line segments in map; empty where there are none, for rviz complains.
+
+    ends : (m, 2, 2), metres.  colors : (m, 3) or (3,), red, green, blue from 0 to 1.  height : metres above the floor.
+    """
+    points = [make("geometry_msgs/msg/Point", x=x, y=y, z=float(height)) for x, y in ends.reshape(-1, 2).tolist()]
+    each = np.broadcast_to(np.asarray(colors, dtype=float), (len(ends), 3)).repeat(2, axis=0)
+    colored = [make("std_msgs/msg/ColorRGBA", r=r, g=g, b=b, a=1.0) for r, g, b in each.tolist()]
+    empty = np.zeros(0, np.uint8)
+    marker = make(
+        "visualization_msgs/msg/Marker",
+        header=header(time_ns, "map"),
+        ns=name,
+        id=0,
+        type=5,  # LINE_LIST
+        action=0,
+        pose=pose_message((0.0, 0.0, 0.0)),
+        scale=make("geometry_msgs/msg/Vector3", x=width, y=0.0, z=0.0),
+        color=colored[0] if colored else None,
+        lifetime=make("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
+        frame_locked=False,
+        points=points,
+        colors=colored,
+        texture_resource="",
+        texture=make("sensor_msgs/msg/CompressedImage", header=header(0, ""), format="", data=empty),
+        uv_coordinates=[],
+        text="",
+        mesh_resource="",
+        mesh_file=make("visualization_msgs/msg/MeshFile", filename="", data=empty),
+        mesh_use_embedded_materials=False,
+    )
+    return make(MARKER_ARRAY, markers=[marker] if points else [])

@@ -3,9 +3,12 @@
 | topic | type | holds |
 |---|---|---|
 | /tf_static | tf2_msgs/TFMessage | mounts of the lasers |
-| /bsmap/slam | std_msgs/String | JSON: format, version, lasers, line map; all that is not one row a scan |
+| /bsmap/slam | std_msgs/String | JSON: format, version, lasers, line map, loops; all that is not one row a scan |
 | /map/segments | visualization_msgs/MarkerArray | the line map |
+| /map/closures | visualization_msgs/MarkerArray | loops: green where they hold, red where they were refused |
 | /trajectory | nav_msgs/Path | all poses |
+| /trajectory_tracked | nav_msgs/Path | all poses before loops were closed |
+| /bsmap/tracked | std_msgs/Float64MultiArray | the same poses, x, y, theta |
 | /pose | geometry_msgs/PoseWithCovarianceStamped | pose of base_link in map and its covariance, one a horizontal scan |
 | /tf | tf2_msgs/TFMessage | map -> base_link, the same poses |
 | /bsmap/steps | std_msgs/Float64MultiArray | theta, new, stored, matched, nis, dof of each step |
@@ -27,13 +30,22 @@ from bsmap_cli.errors import BadInputError
 from bsmap_cli.io import ros
 from bsmap_cli.io.artifact import Provenance
 from bsmap_cli.io.mcap_file import RosWriter, read_messages, ros_writer
-from bsmap_cli.model import Array, LaserScans, LineMap, SlamMap, StepStatistics, Trajectory
+from bsmap_cli.model import (
+    Array,
+    IntArray,
+    LaserScans,
+    LineMap,
+    LoopClosures,
+    SlamMap,
+    StepStatistics,
+    Trajectory,
+    segment_ends,
+)
 
-VERSION = 1
-STRING = "std_msgs/msg/String"
-NUMBERS = "std_msgs/msg/Float64MultiArray"
+VERSION = 2
 STEP_COLUMNS = "theta new stored matched nis dof"
-_READ = (STRING, NUMBERS, ros.POSE_WITH_COVARIANCE, ros.LASER_SCAN)
+_READ = (ros.STRING, ros.NUMBERS, ros.POSE_WITH_COVARIANCE, ros.LASER_SCAN)
+SEGMENT_COLOR, HELD_COLOR, REFUSED_COLOR = (0.1, 0.5, 1.0), (0.1, 0.8, 0.2), (0.9, 0.2, 0.1)
 _LASER_FIELDS = ("angle_min", "angle_increment", "time_increment", "range_min", "range_max", "frame_id", "topic")
 
 
@@ -80,9 +92,18 @@ def _map_messages(slam: SlamMap, start: int) -> Iterator[tuple[str, Any]]:
         mounts[slam.vertical.frame_id] = slam.vertical.mount
     transforms = [ros.transform_message(T, start, "base_link", frame) for frame, T in mounts.items()]
     yield "/tf_static", ros.tf_message(transforms)
-    yield "/bsmap/slam", ros.make(STRING, data=json.dumps(_header(slam), separators=(",", ":")))
-    yield "/map/segments", ros.make(ros.MARKER_ARRAY, markers=_markers(slam.lines, slam.horizontal_mount[2, 3], start))
-    yield "/trajectory", _path(slam.trajectory, start)
+    yield "/bsmap/slam", ros.make(ros.STRING, data=json.dumps(_header(slam), separators=(",", ":")))
+    height = slam.horizontal_mount[2, 3]
+    segments = segment_ends(slam.lines)
+    yield "/map/segments", ros.line_list_message("segments", segments, SEGMENT_COLOR, 0.03, height, start)
+    loops = slam.closures
+    chords = np.stack([slam.trajectory.poses[loops.first, :2], slam.trajectory.poses[loops.second, :2]], axis=1)
+    colors = np.where(loops.held[:, None], HELD_COLOR, REFUSED_COLOR)
+    yield "/map/closures", ros.line_list_message("closures", chords, colors, 0.05, height, start)
+    yield "/trajectory", _path(slam.trajectory.time_ns, slam.trajectory.poses, start)
+    if slam.tracked_poses is not None:
+        yield "/trajectory_tracked", _path(slam.trajectory.time_ns, slam.tracked_poses, start)
+        yield "/bsmap/tracked", ros.numbers_message(slam.tracked_poses, "x y theta")
 
 
 def _header(slam: SlamMap) -> dict[str, Any]:
@@ -96,48 +117,16 @@ def _header(slam: SlamMap) -> dict[str, Any]:
         "horizontal": {"frame_id": slam.horizontal_frame_id, "mount": slam.horizontal_mount.tolist()},
         "vertical": vertical,
         "lines": {name: np.asarray(values).tolist() for name, values in vars(slam.lines).items()},
+        "closures": {name: np.asarray(values).tolist() for name, values in vars(slam.closures).items()},
     }
 
 
-def _markers(lines: LineMap, height: float, start: int) -> list[Any]:
-    """One LINE_LIST of all segments at the laser's height; none where there are no lines, for rviz complains."""
-    alpha, r = lines.parameters.T
-    normal, along = np.column_stack([np.cos(alpha), np.sin(alpha)]), np.column_stack([-np.sin(alpha), np.cos(alpha)])
-    foot = normal * r[:, None]
-    ends = np.stack([foot + along * lines.extents[:, [k]] for k in (0, 1)], axis=1).reshape(-1, 2)
-    marker = ros.make(
-        "visualization_msgs/msg/Marker",
-        header=ros.header(start, "map"),
-        ns="segments",
-        id=0,
-        type=5,  # LINE_LIST
-        action=0,
-        pose=ros.pose_message((0.0, 0.0, 0.0)),
-        scale=ros.make("geometry_msgs/msg/Vector3", x=0.03, y=0.0, z=0.0),
-        color=ros.make("std_msgs/msg/ColorRGBA", r=0.1, g=0.5, b=1.0, a=1.0),
-        lifetime=ros.make("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
-        frame_locked=False,
-        points=[ros.make("geometry_msgs/msg/Point", x=x, y=y, z=float(height)) for x, y in ends.tolist()],
-        colors=[],
-        texture_resource="",
-        texture=ros.make(
-            "sensor_msgs/msg/CompressedImage", header=ros.header(0, ""), format="", data=np.zeros(0, np.uint8)
-        ),
-        uv_coordinates=[],
-        text="",
-        mesh_resource="",
-        mesh_file=ros.make("visualization_msgs/msg/MeshFile", filename="", data=np.zeros(0, np.uint8)),
-        mesh_use_embedded_materials=False,
-    )
-    return [marker] if len(ends) else []
-
-
-def _path(trajectory: Trajectory, start: int) -> Any:
-    poses = [
+def _path(time_ns: IntArray, poses: Array, start: int) -> Any:
+    stamped = [
         ros.make("geometry_msgs/msg/PoseStamped", header=ros.header(t, "map"), pose=ros.pose_message(pose))
-        for t, pose in zip(trajectory.time_ns.tolist(), trajectory.poses, strict=True)
+        for t, pose in zip(time_ns.tolist(), poses, strict=True)
     ]
-    return ros.make(ros.PATH, header=ros.header(start, "map"), poses=poses)
+    return ros.make(ros.PATH, header=ros.header(start, "map"), poses=stamped)
 
 
 def _steps(slam: SlamMap) -> Iterator[_Messages]:
@@ -150,19 +139,15 @@ def _steps(slam: SlamMap) -> Iterator[_Messages]:
             ros.POSE_WITH_COVARIANCE, header=ros.header(t, "map"), pose=ros.pose_with_covariance(pose, covariance)
         )
         tf = ros.tf_message([ros.transform_message(planar_matrix(pose), t, "map", "base_link")])
-        yield _Messages(t, (("/pose", stamped), ("/tf", tf), ("/bsmap/steps", _numbers(numbers[k]))))
+        yield _Messages(
+            t, (("/pose", stamped), ("/tf", tf), ("/bsmap/steps", ros.numbers_message(numbers[k], STEP_COLUMNS)))
+        )
 
 
 def planar_matrix(pose: Array) -> Array:
     """Matrix (4, 4) of a planar pose (3,) x, y, theta."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     return np.array([[c, -s, 0, pose[0]], [s, c, 0, pose[1]], [0, 0, 1, 0], [0, 0, 0, 1.0]])
-
-
-def _numbers(row: Array) -> Any:
-    dimension = ros.make("std_msgs/msg/MultiArrayDimension", label=STEP_COLUMNS, size=len(row), stride=len(row))
-    layout = ros.make("std_msgs/msg/MultiArrayLayout", dim=[dimension], data_offset=0)
-    return ros.make(NUMBERS, layout=layout, data=row)
 
 
 def _vertical_scans(vertical: LaserScans | None) -> Iterator[_Messages]:
@@ -198,6 +183,8 @@ def read_slam(path: Path | str) -> SlamMap:
         vertical=vertical and _laser(vertical, messages.get(vertical["topic"], [])),
         horizontal_mount=np.array(header["horizontal"]["mount"]),
         horizontal_frame_id=header["horizontal"]["frame_id"],
+        closures=_closures(header["closures"]),
+        tracked_poses=_tracked(messages.get("/bsmap/tracked", [])),
     )
 
 
@@ -231,6 +218,19 @@ def _lines(plain: dict[str, Any]) -> LineMap:
         sides=np.array(plain["sides"], dtype=np.int64),
         hits=np.array(plain["hits"], dtype=np.int64),
     )
+
+
+def _closures(plain: dict[str, Any]) -> LoopClosures:
+    return LoopClosures(
+        first=np.array(plain["first"], dtype=np.int64),
+        second=np.array(plain["second"], dtype=np.int64),
+        relative=np.array(plain["relative"], dtype=float).reshape(-1, 3),
+        held=np.array(plain["held"], dtype=bool),
+    )
+
+
+def _tracked(messages: list[Any]) -> Array | None:
+    return np.array(messages[0].data, dtype=float).reshape(-1, 3) if messages else None
 
 
 def _statistics(numbers: Array) -> StepStatistics:

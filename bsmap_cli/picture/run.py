@@ -7,27 +7,19 @@ from typing import Any
 import numpy as np
 
 from bsmap_cli.core.bspline import evaluate_grid
-from bsmap_cli.model import Array, LineMap, PointCloud, SlamMap, SurfaceMap
+from bsmap_cli.model import PointCloud, SlamMap, SurfaceMap, segment_ends
+from bsmap_cli.picture.figure import new_figure, save
 
 MOST_POINTS = 60_000
 
 
 def draw_run(path: Path, ending: str, slam_map: SlamMap, cloud: PointCloud, maps: Sequence[SurfaceMap]) -> None:
     """Write a picture to `path` in the format of `ending` (.png, .svg, .pdf): a plan, and each map from above."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7 * (1 + len(maps)), 7), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(7 * (1 + len(maps)), 7)
     _draw_plan(figure.add_subplot(1, 1 + len(maps), 1), slam_map, cloud)
     for k, one in enumerate(maps):
         _draw_surfaces(figure.add_subplot(1, 1 + len(maps), 2 + k, projection="3d"), one)
-    # Without a date the same run gives the same bytes.
-    figure.savefig(path, format=ending.lstrip(".") or "png", dpi=110, metadata=_no_date(ending))
-
-
-def _no_date(ending: str) -> dict[str, Any]:
-    return {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(ending, {})
+    save(figure, path, ending)
 
 
 def _draw_plan(axes: Any, slam_map: SlamMap, cloud: PointCloud) -> None:
@@ -39,13 +31,6 @@ def _draw_plan(axes: Any, slam_map: SlamMap, cloud: PointCloud) -> None:
     axes.plot(*slam_map.trajectory.poses[:, :2].T, "r-", lw=1.2, label="trajectory")
     axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title="plan")
     axes.legend(loc="upper right", fontsize=8)
-
-
-def segment_ends(lines: LineMap) -> Array:
-    """(m, 2, 2) both end points of each segment, in map."""
-    alpha, r = lines.parameters.T
-    n, t = np.stack([np.cos(alpha), np.sin(alpha)], -1), np.stack([-np.sin(alpha), np.cos(alpha)], -1)
-    return (n * r[:, None])[:, None] + t[:, None] * lines.extents[..., None]
 
 
 def _draw_surfaces(axes: Any, one: SurfaceMap) -> None:

@@ -7,9 +7,10 @@ import numpy as np
 
 from bsmap_cli import open3d_loader
 from bsmap_cli.core import se2
-from bsmap_cli.core.bspline import Surface, evaluate_grid
+from bsmap_cli.core.bspline import Surface, evaluate_grid, evaluate_surface
+from bsmap_cli.core.trims import inside_trims
 from bsmap_cli.errors import BsmapError
-from bsmap_cli.model import Array, IntArray, PointCloud, Residuals, SurfaceMap, Trajectory
+from bsmap_cli.model import Array, BSplineSurface, IntArray, PointCloud, Residuals, SurfaceMap, Trajectory
 
 POINTS_AT_ONCE = 500_000
 COARSE_SAMPLES = 33  # a direction, to measure how long a surface is
@@ -105,7 +106,10 @@ def summary(distances: Array) -> Residuals:
 
 
 def surface_samples(surface_map: SurfaceMap, step: float) -> Array:
-    """Points (n, 3) on all surfaces of a map, about `step` metres apart, edges and corners included."""
+    """Points (n, 3) on all surfaces of a map, about `step` metres apart, edges and corners included.
+
+    Of a trimmed surface those inside its trims, and the corners of its loops.
+    """
     samples = [_samples_of(surface, step) for surface in surface_map.surfaces]
     return np.concatenate([np.empty((0, 3)), *samples])
 
@@ -114,7 +118,12 @@ def _samples_of(surface: Surface, step: float) -> Array:
     coarse = np.linspace(0.0, 1.0, COARSE_SAMPLES)
     grid = evaluate_grid(surface, coarse, coarse)
     u, v = (_even_parameters(coarse, lines, step) for lines in (grid, grid.swapaxes(0, 1)))
-    return evaluate_grid(surface, u, v).reshape(-1, 3)
+    if not (isinstance(surface, BSplineSurface) and surface.trims):
+        return evaluate_grid(surface, u, v).reshape(-1, 3)
+    parameters = np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2)
+    corners = [loop.parameters for loop in surface.trims]
+    parameters = np.concatenate([parameters[inside_trims(surface, parameters)], *corners])
+    return evaluate_surface(surface, *parameters.T)
 
 
 def _even_parameters(coarse: Array, lines: Array, step: float) -> Array:

@@ -253,6 +253,53 @@ class SurfaceCovariance:
 
 
 @dataclass(frozen=True)
+class HeightCovariance:
+    """Covariance of a surface whose control points move along given directions only: a sensor part and pose parts.
+
+    The surface was fitted as a field of scalar heights; control point (i, j) moves by its height along its direction.
+    A point S(u, v) has the sensor part G M G', column (i, j) of G being N_i(u) N_j(v) d_ij: exact, and small.
+
+    directions : (nu or 1, nv or 1, 3) unit vectors in map; where there is 1, it holds for all.
+    matrix : (nu * nv, nu * nv) of the heights, square metres, heights in the order of the control points.
+    """
+
+    directions: Array
+    matrix: Array
+    pose: tuple[PosePart, ...]
+
+    def __post_init__(self) -> None:
+        size = len(self.matrix)
+        _check(self, directions=(None, None, 3), matrix=(size, size))
+
+
+@dataclass(frozen=True)
+class TrimLoop:
+    """Closed polygon in a surface's parameters.
+
+    parameters : (k, 2) u, v in [0, 1].
+    creases : (k,) number in SurfaceMap.creases of the crease that the side from this vertex to the next one runs
+    along, -1 for an open border.
+    """
+
+    parameters: Array
+    creases: IntArray
+
+    def __post_init__(self) -> None:
+        _check(self, parameters=(None, 2), creases=(len(self.parameters),))
+
+
+@dataclass(frozen=True)
+class Crease:
+    """Curve in which two surfaces meet: a polyline (k, 3) in map, which the trim loops of both refer to."""
+
+    surfaces: tuple[str, str]
+    points: Array
+
+    def __post_init__(self) -> None:
+        _check(self, points=(None, 3))
+
+
+@dataclass(frozen=True)
 class Residuals:
     """Distances of the data to the surface at the parameters of the fit, metres."""
 
@@ -267,8 +314,10 @@ class Residuals:
 class BSplineSurface:
     """Tensor-product B-spline surface S(u, v) on [0, 1] x [0, 1] in map, Eq. (19).
 
-    u runs along the scan lines, v across them. knots_u : (nu + p + 1,), knots_v : (nv + q + 1,), clamped.
-    control_points : (nu, nv, 3).  name : of the surface, unique in its map.  data_sets : it was fitted to.
+    knots_u : (nu + p + 1,), knots_v : (nv + q + 1,), clamped.  control_points : (nu, nv, 3).
+    name : of the surface, unique in its map.  data_sets : it was fitted to.
+    trims : what of it was seen: the points around which the loops together wind counter-clockwise, holes being run
+    around clockwise. Loops may overlap. Without trims it is the whole surface.
     """
 
     name: str
@@ -278,14 +327,22 @@ class BSplineSurface:
     knots_u: Array
     knots_v: Array
     control_points: Array
-    covariance: SurfaceCovariance
+    covariance: SurfaceCovariance | HeightCovariance
     residuals: Residuals
+    trims: tuple[TrimLoop, ...] = ()
 
     def __post_init__(self) -> None:
         nu, nv = len(self.knots_u) - self.degree_u - 1, len(self.knots_v) - self.degree_v - 1
         _check(self, control_points=(nu, nv, 3))
-        if np.shape(self.covariance.blocks) != (nu, nv, 6):
-            raise ValueError(f"covariance of shape {self.covariance.blocks.shape} for {nu} x {nv} control points")
+        if isinstance(self.covariance, HeightCovariance):
+            fits = len(self.covariance.matrix) == nu * nv
+            fits &= all(k in (1, n) for k, n in zip(self.covariance.directions.shape, (nu, nv), strict=False))
+            shape: tuple[int, ...] = self.covariance.matrix.shape
+        else:
+            shape = np.shape(self.covariance.blocks)
+            fits = shape == (nu, nv, 6)
+        if not fits:
+            raise ValueError(f"covariance of shape {shape} for {nu} x {nv} control points")
 
 
 @dataclass(frozen=True)
@@ -318,3 +375,4 @@ class SurfaceMap:
     data_sets: tuple[DataSet, ...]
     decisions: tuple[Decision, ...] = ()
     notes: dict[str, Any] = field(default_factory=dict)
+    creases: tuple[Crease, ...] = ()

@@ -65,8 +65,8 @@ class SlamParams(Checked):
     split_distance: float = parameter(0.05, "Points farther off their segment's chord split it.", "m", 0.001, 1.0)
     min_points: int = parameter(6, "Fewest points of a segment.", "", 3)
     min_length: float = parameter(0.3, "Shortest segment.", "m", 0.01)
-    line_angle_floor: float = parameter(0.002, "Floor of a line's angle error: no wall is flat.", "rad", 0.0, 0.1)
-    line_offset_floor: float = parameter(0.003, "Floor of a line's offset error: no wall is flat.", "m", 0.0, 0.5)
+    line_angle_floor: float = parameter(0.0005, "Floor of a line's angle error: no wall is flat.", "rad", 0.0, 0.1)
+    line_offset_floor: float = parameter(0.001, "Floor of a line's offset error: no wall is flat.", "m", 0.0, 0.5)
     odometry_translation: float = parameter(0.1, "Odometry's error in place for each metre driven.", "m", 0.0, 1.0)
     odometry_rotation: float = parameter(0.1, "Odometry's error in heading for each radian turned.", "", 0.0, 1.0)
     odometry_coupling: float = parameter(
@@ -104,6 +104,9 @@ class CloudParams(Checked):
 class FitParams(Checked):
     """Movement data sets and B-spline surfaces, method.md sections 6-8."""
 
+    method: str = parameter(
+        "paper", "One surface for each smooth face, or the paper's one for each data set.", choices=("faces", "paper")
+    )
     degree_u: int = parameter(3, "Degree along the scan lines.", "", 1, 7)
     degree_v: int = parameter(3, "Degree across the scan lines.", "", 1, 7)
     bound_u: float = parameter(0.01, "Largest error allowed along the scan lines.", "m", 1e-4)

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bsmap_cli.core.bspline import basis_functions, evaluate_surface
+from bsmap_cli.core.bspline import basis_functions, design_matrix, evaluate_surface
 from bsmap_cli.core.gaussian import symmetric_sqrt, unpack
-from bsmap_cli.model import Array, BSplineSurface, PosePart
+from bsmap_cli.model import Array, BSplineSurface, HeightCovariance, PosePart, SurfaceCovariance
 
 CHUNK = 2048
 
@@ -31,22 +31,35 @@ def pose_covariance(pose: Sequence[PosePart], points: Array) -> Array:
 def sensor_covariance(surface: BSplineSurface, u: ArrayLike, v: ArrayLike) -> Array:
     """Sensor part B C_P B' of the covariance (n, 3, 3) at scattered parameters u, v (n,), Eq. (37)."""
     u, v = np.asarray(u, dtype=float), np.asarray(v, dtype=float)
-    roots = symmetric_sqrt(unpack(surface.covariance.blocks))
+    covariance = surface.covariance
     result = np.empty((len(u), 3, 3))
+    roots = np.zeros(0) if isinstance(covariance, HeightCovariance) else symmetric_sqrt(unpack(covariance.blocks))
     for start in range(0, len(u), CHUNK):
         part = slice(start, start + CHUNK)
-        result[part] = _sensor_chunk(surface, roots, u[part], v[part])
+        if isinstance(covariance, HeightCovariance):
+            result[part] = _heights_chunk(surface, covariance, u[part], v[part])
+        else:
+            result[part] = _sensor_chunk(surface, covariance, roots, u[part], v[part])
     return result
 
 
-def _sensor_chunk(surface: BSplineSurface, roots: Array, u: Array, v: Array) -> Array:
+def _heights_chunk(surface: BSplineSurface, covariance: HeightCovariance, u: Array, v: Array) -> Array:
+    """G M G' with column (i, j) of G being N_i N_j d_ij."""
+    along_u = design_matrix(surface.knots_u, surface.degree_u, u)
+    along_v = design_matrix(surface.knots_v, surface.degree_v, v)
+    directions = np.broadcast_to(covariance.directions, surface.control_points.shape)
+    G = np.einsum("ni,nj,ijk->nkij", along_u, along_v, directions, optimize=True).reshape(len(u), 3, -1)
+    return np.asarray((G @ covariance.matrix) @ np.swapaxes(G, 1, 2))
+
+
+def _sensor_chunk(surface: BSplineSurface, covariance: SurfaceCovariance, roots: Array, u: Array, v: Array) -> Array:
     """sum over local i, j, k, l of  M_ij rho_u[i, k] rho_v[j, l] M_kl'  with  M_ij = N_i N_j L_ij."""
     first_u, basis_u = basis_functions(surface.knots_u, surface.degree_u, u)
     first_v, basis_v = basis_functions(surface.knots_v, surface.degree_v, v)
     i = first_u[:, None] + np.arange(surface.degree_u + 1)
     j = first_v[:, None] + np.arange(surface.degree_v + 1)
-    rho_u = surface.covariance.correlation_u[i[:, :, None], i[:, None, :]]
-    rho_v = surface.covariance.correlation_v[j[:, :, None], j[:, None, :]]
+    rho_u = covariance.correlation_u[i[:, :, None], i[:, None, :]]
+    rho_v = covariance.correlation_v[j[:, :, None], j[:, None, :]]
     weights = basis_u[:, 0, :, None] * basis_v[:, 0, None, :]
     M = weights[..., None, None] * roots[i[:, :, None], j[:, None, :]]
     n, k, m = weights.shape
@@ -62,5 +75,11 @@ def surface_covariance(surface: BSplineSurface, u: ArrayLike, v: ArrayLike) -> A
 
 def control_point_covariances(surface: BSplineSurface) -> Array:
     """Covariance (nu, nv, 3, 3) in map of each control point, sensor and pose part, Eq. (33)."""
-    blocks = unpack(surface.covariance.blocks)
+    covariance = surface.covariance
+    if isinstance(covariance, HeightCovariance):
+        directions = np.broadcast_to(covariance.directions, surface.control_points.shape)
+        variances = np.diag(covariance.matrix).reshape(surface.control_points.shape[:2])
+        blocks = variances[..., None, None] * directions[..., :, None] * directions[..., None, :]
+    else:
+        blocks = unpack(covariance.blocks)
     return blocks + pose_covariance(surface.covariance.pose, surface.control_points)

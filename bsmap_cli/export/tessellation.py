@@ -15,8 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bsmap_cli.core.bspline import Surface, evaluate_grid
+from bsmap_cli.core.bspline import Surface, evaluate_grid, evaluate_surface
 from bsmap_cli.errors import ParameterError
+from bsmap_cli.export.trimmed import triangulate
 from bsmap_cli.model import Array, BSplineSurface, IntArray
 
 MOST_POINTS = 10_000_000
@@ -47,12 +48,17 @@ class Bounds(NamedTuple):
 def tessellate(surface: BSplineSurface, tolerance: float) -> Mesh:
     """Mesh within `tolerance` metres of the surface, as measured by `mesh_distance`; its front is S_u x S_v.
 
+    Of a trimmed surface only what lies inside its trims.
+
     Raises
     ------
     ParameterError
         The tolerance asks for more than `MOST_POINTS` points.
     """
     u, v = grid_parameters(surface, tolerance)
+    if surface.trims:
+        parameters, triangles = triangulate(surface, u, v)
+        return _without_slivers(evaluate_surface(surface, *parameters.T), triangles)
     points = evaluate_grid(surface, u, v)
     return _without_slivers(points.reshape(-1, 3), _grid_triangles(len(u), len(v)))
 

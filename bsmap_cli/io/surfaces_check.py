@@ -1,5 +1,6 @@
 """Checked way from the JSON of surfaces_json.py to the model: what is wrong is told by surface, field and value."""
 
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -7,17 +8,22 @@ import numpy as np
 from bsmap_cli.model import (
     Array,
     BSplineSurface,
+    Crease,
     DataSet,
     Decision,
+    HeightCovariance,
+    IntArray,
     PosePart,
     Residuals,
     SurfaceCovariance,
     SurfaceMap,
+    TrimLoop,
 )
 
 # Rounding to 4 significant digits, or 6 decimals, makes a singular covariance indefinite by less than these.
 BLOCK_TOLERANCE = 1e-3
 CORRELATION_TOLERANCE = 1e-4
+HEIGHT_TOLERANCE = 1e-6
 
 
 class MalformedError(ValueError):
@@ -26,19 +32,33 @@ class MalformedError(ValueError):
 
 def parse_map(plain: dict[str, Any]) -> SurfaceMap:
     """Surfaces of a file's JSON object; MalformedError where it does not make sense."""
-    surfaces = tuple(_surface(s, f"surfaces[{i}]") for i, s in enumerate(_get(plain, "surfaces", list, "file")))
-    names = [surface.name for surface in surfaces]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
+    creases = tuple(_crease(c, f"creases[{i}]") for i, c in enumerate(_get(plain, "creases", list, "file")))
+    surfaces = tuple(
+        _surface(s, f"surfaces[{i}]", len(creases)) for i, s in enumerate(_get(plain, "surfaces", list, "file"))
+    )
+    counts = Counter(surface.name for surface in surfaces)
+    if twice := sorted(name for name, count in counts.items() if count > 1):
         raise MalformedError(f"surfaces: the name {twice[0]!r} is there twice")
+    for i, crease in enumerate(creases):
+        if unknown := [name for name in crease.surfaces if name not in counts]:
+            raise MalformedError(f"creases[{i}]: there is no surface {unknown[0]!r}")
     return SurfaceMap(
         surfaces=surfaces,
         data_sets=tuple(_data_set(d, f"data_sets[{i}]") for i, d in enumerate(_get(plain, "data_sets", list, "file"))),
         decisions=tuple(_decision(d, f"decisions[{i}]") for i, d in enumerate(_get(plain, "decisions", list, "file"))),
         notes=_get(plain, "notes", dict, "file"),
+        creases=creases,
     )
 
 
-def _surface(plain: Any, where: str) -> BSplineSurface:
+def _crease(plain: Any, where: str) -> Crease:
+    names = _names(plain, "surfaces", where)
+    if len(names) != 2:
+        raise MalformedError(f"{where}: surfaces has {len(names)} names, wanted 2")
+    return Crease((names[0], names[1]), _array(plain, "points", (None, 3), where))
+
+
+def _surface(plain: Any, where: str, creases: int) -> BSplineSurface:
     name = _get(plain, "name", str, where)
     where = f"{where} ({name})"
     p, q = (_degree(plain, key, where) for key in ("degree_u", "degree_v"))
@@ -54,7 +74,27 @@ def _surface(plain: Any, where: str) -> BSplineSurface:
         control_points=_array(plain, "control_points", (nu, nv, 3), where),
         covariance=_covariance(_get(plain, "covariance", dict, where), nu, nv, f"{where}: covariance"),
         residuals=_residuals(_get(plain, "residuals", dict, where), f"{where}: residuals"),
+        trims=tuple(
+            _loop(loop, creases, f"{where}: trims[{i}]") for i, loop in enumerate(_get(plain, "trims", list, where))
+        ),
     )
+
+
+def _loop(plain: Any, creases: int, where: str) -> TrimLoop:
+    parameters = _array(plain, "parameters", (None, 2), where)
+    if len(parameters) < 3:
+        raise MalformedError(f"{where}: parameters has {len(parameters)} vertices, wanted 3 or more")
+    if np.any((parameters < 0.0) | (parameters > 1.0)):
+        raise MalformedError(f"{where}: parameters lie outside [0, 1]")
+    return TrimLoop(parameters, _crease_numbers(plain, len(parameters), creases, where))
+
+
+def _crease_numbers(plain: Any, count: int, creases: int, where: str) -> IntArray:
+    numbers = _array(plain, "creases", (count,), where)
+    bad = np.flatnonzero((numbers != np.rint(numbers)) | (numbers < -1) | (numbers >= creases))
+    if len(bad):
+        raise MalformedError(f"{where}: creases[{bad[0]}] is {numbers[bad[0]]:g}, wanted -1 or a number of a crease")
+    return numbers.astype(np.int64)
 
 
 def _degree(plain: dict[str, Any], key: str, where: str) -> int:
@@ -85,7 +125,9 @@ def _knots(plain: dict[str, Any], key: str, degree: int, where: str) -> Array:
     return knots
 
 
-def _covariance(plain: dict[str, Any], nu: int, nv: int, where: str) -> SurfaceCovariance:
+def _covariance(plain: dict[str, Any], nu: int, nv: int, where: str) -> SurfaceCovariance | HeightCovariance:
+    if "directions" in plain:
+        return _heights(plain, nu, nv, where)
     blocks = _array(plain, "blocks", (nu, nv, 6), where)
     _check_blocks(blocks, where)
     parts = _get(plain, "pose", list, where)
@@ -95,6 +137,23 @@ def _covariance(plain: dict[str, Any], nu: int, nv: int, where: str) -> SurfaceC
         correlation_v=_correlation(plain, "correlation_v", nv, where),
         pose=tuple(_pose_part(part, f"{where}: pose[{i}]") for i, part in enumerate(parts)),
     )
+
+
+def _heights(plain: dict[str, Any], nu: int, nv: int, where: str) -> HeightCovariance:
+    directions = _array(plain, "directions", (None, None, 3), where)
+    if directions.shape[0] not in (1, nu) or directions.shape[1] not in (1, nv):
+        got = " x ".join(map(str, directions.shape))
+        raise MalformedError(f"{where}: directions is {got}, wanted {nu} or 1 x {nv} or 1 x 3")
+    if np.any(np.abs(np.linalg.norm(directions, axis=2) - 1.0) > 1e-6):
+        raise MalformedError(f"{where}: directions are not of length 1")
+    n = nu * nv
+    matrix = _symmetric(_array(plain, "matrix", (n * (n + 1) // 2,), where), n)
+    eigenvalues = np.linalg.eigvalsh(matrix)
+    if eigenvalues[0] < -HEIGHT_TOLERANCE * abs(eigenvalues[-1]):
+        raise MalformedError(f"{where}: matrix is not positive semidefinite (eigenvalue {eigenvalues[0]:.3g})")
+    parts = _get(plain, "pose", list, where)
+    pose = tuple(_pose_part(part, f"{where}: pose[{i}]") for i, part in enumerate(parts))
+    return HeightCovariance(directions, matrix, pose)
 
 
 def _check_blocks(blocks: Array, where: str) -> None:

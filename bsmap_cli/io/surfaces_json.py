@@ -1,25 +1,33 @@
 """The artifact of `fit` and `merge`: B-spline surfaces as JSON (.surfaces.json, .map.json; .gz by name).
 
-    {"format": "bsmap-surfaces", "version": 1, "units": "metres, radians, frame map",
+    {"format": "bsmap-surfaces", "version": 2, "units": "metres, radians, frame map",
      "bsmap-provenance": {...},
      "data_sets": [{"name", "movement": "translation" | "rotation", "first_scan", "last_scan", "points"}, ...],
      "surfaces": [surface, ...],
      "decisions": [{"first", "second", "outcome": "merged" | "refused", "reason", "figures": {...}}, ...],
+     "creases": [{"surfaces": [name, name], "points": k x 3 polyline}, ...],
      "notes": {...}}
 
     surface = {"name", "data_sets": [names],
      "degree_u", "degree_v",
      "knots_u", "knots_v":     full clamped knot vectors on [0, 1]: nu + degree_u + 1 and nv + degree_v + 1 numbers
-     "control_points":         nu x nv x 3; u runs along the scan lines, v across them
+     "control_points":         nu x nv x 3
      "covariance": {
         "blocks":              nu x nv x 6: xx, xy, xz, yy, yz, zz of the control points' sensor part
         "correlation_u", "correlation_v":   upper triangles row by row, nu (nu + 1) / 2 and nv (nv + 1) / 2 numbers
-        "pose": [{"data_set", "centre": [x, y], "covariance": [xx, xy, xt, yy, yt, tt], "weight"}, ...]},
+        or, of control points that move along given directions only,
+        "directions":          nu or 1 x nv or 1 x 3 unit vectors
+        "matrix":              upper triangle row by row of the heights' covariance, n (n + 1) / 2 numbers, n = nu nv
+        and "pose": [{"data_set", "centre": [x, y], "covariance": [xx, xy, xt, yy, yt, tt], "weight"}, ...]},
+     "trims": [{"parameters": k x 2, u and v of a closed polygon,
+                "creases": k numbers of the creases along the sides from each vertex to the next, -1 for none}, ...]
+                             no trims: the whole surface; else what the loops together wind around counter-clockwise
      "residuals": {"points", "mean", "rms", "percentile_95", "maximum"}}
 
 model.py tells what each of them means. Numbers are rounded to what they are worth, for the bytes of a map matter:
-coordinates and correlations to 1e-6, knots to 1e-10, covariances to 4 and residuals to 6 significant digits. A map that
-was read is written again byte for byte.
+coordinates and correlations to 1e-6, knots to 1e-10, creases and parameters of trims to 1e-5, covariances to 4 (those
+of heights, which are differences of large numbers, to 7) and residuals to 6 significant digits. A map that was read is
+written again byte for byte.
 """
 
 import gzip
@@ -34,10 +42,19 @@ import numpy as np
 from bsmap_cli.errors import BadInputError, MissingInputError
 from bsmap_cli.io.artifact import Provenance, atomic_output, plain_json
 from bsmap_cli.io.surfaces_check import MalformedError, parse_map
-from bsmap_cli.model import Array, BSplineSurface, PosePart, SurfaceCovariance, SurfaceMap
+from bsmap_cli.model import (
+    Array,
+    BSplineSurface,
+    Crease,
+    HeightCovariance,
+    PosePart,
+    SurfaceCovariance,
+    SurfaceMap,
+    TrimLoop,
+)
 
 FORMAT = "bsmap-surfaces"
-VERSION = 1
+VERSION = 2
 
 
 def write_surfaces(path: Path | str, surfaces: SurfaceMap, provenance: Provenance | None = None) -> None:
@@ -58,6 +75,7 @@ def write_surfaces(path: Path | str, surfaces: SurfaceMap, provenance: Provenanc
         _list("data_sets", [plain_json(asdict(data_set)) for data_set in surfaces.data_sets]),
         _list("surfaces", [_surface(surface) for surface in surfaces.surfaces]),
         _list("decisions", [plain_json(asdict(decision)) for decision in surfaces.decisions]),
+        _list("creases", [_crease(crease) for crease in surfaces.creases]),
         f'"notes":{_dumps(plain_json(surfaces.notes))}',
     ]
     content = ("{" + ",\n".join(parts) + "}\n").encode()
@@ -87,10 +105,25 @@ def _surface(surface: BSplineSurface) -> dict[str, Any]:
         "covariance": _covariance(surface.covariance),
         "residuals": {"points": int(residuals.points)}
         | {name: _significant(value, 6) for name, value in asdict(residuals).items() if name != "points"},
+        "trims": [_loop(loop) for loop in surface.trims],
     }
 
 
-def _covariance(covariance: SurfaceCovariance) -> dict[str, Any]:
+def _loop(loop: TrimLoop) -> dict[str, Any]:
+    return {"parameters": _rounded(loop.parameters, 5), "creases": np.asarray(loop.creases).tolist()}
+
+
+def _crease(crease: Crease) -> dict[str, Any]:
+    return {"surfaces": list(crease.surfaces), "points": _rounded(crease.points, 5)}
+
+
+def _covariance(covariance: SurfaceCovariance | HeightCovariance) -> dict[str, Any]:
+    if isinstance(covariance, HeightCovariance):
+        return {
+            "directions": _rounded(covariance.directions, 9),
+            "matrix": _significant(_upper(covariance.matrix), 7),
+            "pose": [_pose_part(part) for part in covariance.pose],
+        }
     return {
         "blocks": _significant(covariance.blocks, 4),
         "correlation_u": _rounded(_upper(covariance.correlation_u), 6),

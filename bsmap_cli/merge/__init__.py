@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 
-from bsmap_cli.merge.inputs import unite
+from bsmap_cli.merge.inputs import separate_faces, unite
 from bsmap_cli.merge.joining import merge_pair
 from bsmap_cli.merge.pairs import Overlap, find_overlap
 from bsmap_cli.merge.patch import Patch, make_patch
@@ -47,10 +47,12 @@ def merge_surfaces(maps: Sequence[SurfaceMap], params: MergeParams, *, track: Tr
 
     Returns
     -------
-    SurfaceMap of all merged and all other patches, with a decision for every pair that meets.
+    SurfaceMap of all merged and all other patches, with a decision for every pair that meets. Trimmed surfaces (faces)
+    stay as they are, which a decision says.
     """
-    surfaces, data_sets, former = unite(maps)
-    taken = {surface.name for surface in surfaces}
+    united = unite(maps)
+    surfaces, faces, about_faces = separate_faces(united.surfaces)
+    taken = {surface.name for surface in united.surfaces}
     search = _Search(params, dict(enumerate(make_patch(surface) for surface in surfaces)))
     search.neighbours = {number: set() for number in search.patches}
     _test(search, combinations(search.patches, 2))
@@ -66,7 +68,8 @@ def merge_surfaces(maps: Sequence[SurfaceMap], params: MergeParams, *, track: Tr
     track("merging surfaces", search.tested, search.tested)
     notes = {"pairs_tested": search.tested, "mergings": mergings, "pairs_left_at_limit": len(search.waiting)}
     merged = tuple(patch.surface for patch in search.patches.values())
-    return SurfaceMap(merged, tuple(data_sets), (*former, *search.decisions), notes)
+    decisions = (*united.decisions, *about_faces, *search.decisions)
+    return SurfaceMap((*merged, *faces), united.data_sets, decisions, notes, united.creases)
 
 
 def _test(search: _Search, pairs: Iterable[tuple[int, int]]) -> None:

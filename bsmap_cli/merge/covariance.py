@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from bsmap_cli.core.gaussian import pack, symmetric_sqrt, unpack
-from bsmap_cli.model import Array, PosePart, SurfaceCovariance
+from bsmap_cli.model import Array, HeightCovariance, PosePart, SurfaceCovariance
 
 
-def carry(covariance: SurfaceCovariance, along_u: Array, along_v: Array) -> SurfaceCovariance:
+def carry(covariance: SurfaceCovariance | HeightCovariance, along_u: Array, along_v: Array) -> SurfaceCovariance:
     """Covariance of points P' = sum_a sum_b U_ia V_jb P_ab, Eq. (33) for a map along u and v.
 
     The new blocks are exact under the structure of `SurfaceCovariance`. The new correlations U rho U' and V rho V',
@@ -19,6 +19,8 @@ def carry(covariance: SurfaceCovariance, along_u: Array, along_v: Array) -> Surf
     ----------
     along_u : (mu, nu), along_v : (mv, nv)
     """
+    if isinstance(covariance, HeightCovariance):
+        raise ValueError("height fields are not divided into patches")
     roots = symmetric_sqrt(unpack(covariance.blocks))
     pairs_v = np.einsum("jb,jc,bc->jbc", along_v, along_v, covariance.correlation_v)
     blocks = np.stack([_row_of_blocks(roots, covariance.correlation_u, row, pairs_v) for row in along_u])

@@ -4,11 +4,11 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
-from bsmap_cli.model import BSplineSurface, DataSet, Decision, SurfaceMap
+from bsmap_cli.model import BSplineSurface, Crease, Decision, HeightCovariance, SurfaceMap, TrimLoop
 
 
-def unite(maps: Sequence[SurfaceMap]) -> tuple[list[BSplineSurface], list[DataSet], list[Decision]]:
-    """Surfaces, data sets and former decisions of all maps.
+def unite(maps: Sequence[SurfaceMap]) -> SurfaceMap:
+    """Surfaces, creases, data sets and former decisions of all maps in one.
 
     Where maps share a name, every name gets its map's number (from 1) in front.
     """
@@ -16,9 +16,37 @@ def unite(maps: Sequence[SurfaceMap]) -> tuple[list[BSplineSurface], list[DataSe
         [data_set.name for data_set in m.data_sets] for m in maps
     ):
         maps = [_prefixed(m, f"{number}.") for number, m in enumerate(maps, start=1)]
-    surfaces = [surface for m in maps for surface in m.surfaces]
-    data_sets = [data_set for m in maps for data_set in m.data_sets]
-    return surfaces, data_sets, [decision for m in maps for decision in m.decisions]
+    surfaces: list[BSplineSurface] = []
+    creases: list[Crease] = []
+    for m in maps:
+        surfaces += [_renumbered(surface, len(creases)) for surface in m.surfaces]
+        creases += m.creases
+    data_sets = tuple(data_set for m in maps for data_set in m.data_sets)
+    decisions = tuple(decision for m in maps for decision in m.decisions)
+    return SurfaceMap(tuple(surfaces), data_sets, decisions, {}, tuple(creases))
+
+
+def _renumbered(surface: BSplineSurface, first: int) -> BSplineSurface:
+    """The surface, its creases counted from `first`."""
+    if first == 0 or not surface.trims:
+        return surface
+    loops = (TrimLoop(loop.parameters, loop.creases + first * (loop.creases >= 0)) for loop in surface.trims)
+    return replace(surface, trims=tuple(loops))
+
+
+def separate_faces(
+    surfaces: Iterable[BSplineSurface],
+) -> tuple[list[BSplineSurface], list[BSplineSurface], list[Decision]]:
+    """Surfaces that can be divided into patches, trimmed faces that cannot, and a decision that says so."""
+    whole: list[BSplineSurface] = []
+    faces: list[BSplineSurface] = []
+    for surface in surfaces:
+        trimmed = bool(surface.trims) or isinstance(surface.covariance, HeightCovariance)
+        (faces if trimmed else whole).append(surface)
+    if not faces:
+        return whole, faces, []
+    reason = "trimmed faces stay as they are: merging divides whole surfaces into patches"
+    return whole, faces, [Decision("", "", "refused", reason, {"faces": len(faces)})]
 
 
 def _clash(names: Iterable[Sequence[str]]) -> bool:
@@ -31,7 +59,11 @@ def _prefixed(m: SurfaceMap, prefix: str) -> SurfaceMap:
         m,
         surfaces=tuple(_prefixed_surface(surface, prefix) for surface in m.surfaces),
         data_sets=tuple(replace(data_set, name=prefix + data_set.name) for data_set in m.data_sets),
-        decisions=tuple(replace(d, first=prefix + d.first, second=prefix + d.second) for d in m.decisions),
+        decisions=tuple(
+            replace(d, first=prefix + d.first if d.first else "", second=prefix + d.second if d.second else "")
+            for d in m.decisions
+        ),
+        creases=tuple(replace(c, surfaces=(prefix + c.surfaces[0], prefix + c.surfaces[1])) for c in m.creases),
     )
 
 

@@ -1,0 +1,66 @@
+"""The beams of a data set as a grid of scans and beams: points, directions, ranges."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bsmap_cli.core import se2
+from bsmap_cli.model import Array, IntArray, PointCloud
+
+
+class BeamGrid(NamedTuple):
+    """Beams of m scans, n each; nan where nothing came back.
+
+    points : (m, n, 3) in map.  directions : (m, n, 3) unit vectors of the beams in map.  ranges : (m, n) metres.
+    angles : (n,) of the beams in the scan plane, radians.  hit : (m, n) whether there is a return.
+    sigma : metres, noise along the beam.
+    """
+
+    points: Array
+    directions: Array
+    ranges: Array
+    angles: Array
+    hit: NDArray[np.bool_]
+    sigma: float
+
+
+def make_grid(cloud: PointCloud, scans: IntArray) -> BeamGrid:
+    """Beams of the scans `scans` (m,), ascending; scans without any return are left out.
+
+    The cloud tells each beam's end; its begin is had from the scans' poses, at the time of the beam.
+    """
+    start, stop = np.searchsorted(cloud.scan_index, np.stack([scans, scans + 1]))
+    kept = np.flatnonzero(stop > start)
+    index = np.concatenate([np.arange(start[k], stop[k]) for k in kept] + [np.zeros(0, dtype=np.int64)]).astype(int)
+    row = np.repeat(np.arange(len(kept)), stop[kept] - start[kept])
+    beams = cloud.beam_index[index]
+    first = int(beams.min()) if len(beams) else 0
+    n = int(beams.max(initial=first)) - first + 1
+    column = beams - first
+    points, directions = np.full((2, len(kept), n, 3), np.nan)
+    ranges, hit = np.full((len(kept), n), np.nan), np.zeros((len(kept), n), dtype=bool)
+    along = cloud.points[index] - _origins(cloud, index)
+    length = np.linalg.norm(along, axis=1)
+    points[row, column], ranges[row, column], hit[row, column] = cloud.points[index], length, True
+    directions[row, column] = along / length[:, None]
+    angles = cloud.angle_min + cloud.angle_increment * (first + np.arange(n))
+    return BeamGrid(
+        points, directions, ranges, np.asarray(angles, dtype=np.float64), hit, _noise(ranges, cloud.range_sigma)
+    )
+
+
+def _origins(cloud: PointCloud, index: IntArray) -> Array:
+    """(k, 3) begin in map of the beams of points `index` (k,)."""
+    by_time = np.argsort(cloud.scan_time_ns, kind="stable")
+    poses = se2.interpolate(cloud.scan_time_ns[by_time], cloud.scan_poses[by_time], cloud.time_ns[index])
+    return np.column_stack([se2.transform(poses, cloud.mount[:2, 3]), np.full(len(index), cloud.mount[2, 3])])
+
+
+def _noise(ranges: Array, stated: float) -> float:
+    """Standard deviation of a range: from second differences along the scan lines; as stated without three in a row."""
+    second = np.abs(np.diff(ranges, 2, axis=1))
+    second = second[np.isfinite(second)]
+    if len(second) < 100:
+        return stated
+    return max(float(np.median(second)) / (0.6745 * np.sqrt(6.0)), 0.1 * stated)

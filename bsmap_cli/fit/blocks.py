@@ -1,0 +1,59 @@
+"""Block means of neighbouring beams: an eighth of the data, and nearly the same surface."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from bsmap_cli.fit.beams import BeamGrid
+from bsmap_cli.model import Array, IntArray
+
+LARGEST = 8
+"""Beams of a block."""
+LONGEST = 0.2
+"""Metres from the first to the last beam of a block: over it a surface must be flat to much less than the noise."""
+
+
+class Blocks(NamedTuple):
+    """Means of neighbouring beams of one scan line.
+
+    points : (k, 3) in map.  directions : (k, 3) unit.  counts : (k,) beams.  row, column : (k,) scan and mean beam.
+    owner : (k,) number of the run they come from, ascending.
+    """
+
+    points: Array
+    directions: Array
+    counts: Array
+    row: IntArray
+    column: Array
+    owner: IntArray
+
+    def pick(self, keep: Array) -> "Blocks":
+        """The blocks that an index or a mask (k,) names."""
+        return Blocks(*(field[keep] for field in self))
+
+
+def make_blocks(grid: BeamGrid, row: IntArray, start: IntArray, stop: IntArray) -> Blocks:
+    """Blocks of runs of beams: row (k,), first beam (k,), beam behind the last one (k,)."""
+    length = stop - start
+    n = grid.ranges.shape[1]
+    position = np.arange(int(length.sum())) - np.repeat(np.cumsum(length) - length, length)
+    flat = np.repeat(row * n + start, length) + position
+    owner = np.repeat(np.arange(len(row)), length)
+    hit = grid.hit.ravel()[flat]
+    flat, owner, position = flat[hit], owner[hit], position[hit]
+    if len(flat) == 0:
+        none = np.zeros(0, dtype=np.int64)
+        return Blocks(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), none, np.zeros(0), none)
+    points = grid.points.reshape(-1, 3)[flat]
+    # Equal shares of a run: as many blocks as the number of beams, or the length in metres, asks for.
+    ends = np.zeros((len(row), 2, 3))
+    ends[owner[::-1], 0], ends[owner, 1] = points[::-1], points
+    metres = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    share = np.ceil(np.maximum(length / LARGEST, metres / LONGEST)).astype(np.int64).clip(1)
+    number = position * np.minimum(share, length)[owner] // length[owner]
+    first = np.flatnonzero((np.diff(owner, prepend=-1) != 0) | (np.diff(number, prepend=-1) != 0))
+    counts = np.diff(np.append(first, len(flat))).astype(float)
+    mean = np.add.reduceat(np.column_stack([points, grid.directions.reshape(-1, 3)[flat], flat % n]), first, axis=0)
+    mean /= counts[:, None]
+    directions = mean[:, 3:6] / np.linalg.norm(mean[:, 3:6], axis=1, keepdims=True)
+    return Blocks(mean[:, :3], directions, counts, flat[first] // n, mean[:, 6], owner[first])

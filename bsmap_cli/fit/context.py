@@ -1,0 +1,116 @@
+"""What growing regions needs to know of the pieces: their block means, own chi square, and neighbours."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from bsmap_cli.fit.beams import BeamGrid
+from bsmap_cli.fit.blocks import Blocks, make_blocks
+from bsmap_cli.fit.lowmodels import Sums, chi_square
+from bsmap_cli.fit.pieces import Pieces
+from bsmap_cli.model import Array, IntArray
+
+PRICE = 8.0
+"""Of a parameter, in chi square."""
+SLACK = 0.05
+"""Chi square a beam that a joint surface may be worse, for noise is not quite white."""
+FLATNESS = 0.004
+"""Metres by which a real wall may leave a polynomial without being two."""
+LEAST_OVERLAP = 0.3
+"""Share of the shorter of two pieces of neighbouring scans that lies before beams of the other."""
+
+
+class Context(NamedTuple):
+    """Pieces with what growing needs.
+
+    blocks : of all pieces, in their order.  first : (k + 1,) first block of each piece.
+    chi : (k,) chi square of each piece about its own line.  price : (k,) of its parameters.  beams : (k,) its returns.
+    neighbours : of each piece, those one or two scans away before the same beams.
+    sigma : metres, noise along the beam that block means show, in terms of single beams.
+    """
+
+    pieces: Pieces
+    blocks: Blocks
+    first: IntArray
+    chi: Array
+    price: Array
+    beams: Array
+    neighbours: list[list[int]]
+    sigma: float
+
+    @property
+    def slack(self) -> float:
+        """Chi square a beam that a joint surface may be worse."""
+        return max(SLACK, (FLATNESS / self.sigma) ** 2)
+
+    def blocks_of(self, members: list[int]) -> Blocks:
+        """Blocks of the pieces `members`."""
+        return self.blocks.pick(np.concatenate([np.arange(self.first[k], self.first[k + 1]) for k in members]))
+
+
+def make_context(grid: BeamGrid, pieces: Pieces) -> Context:
+    """Context of all pieces of a data set."""
+    blocks = make_blocks(grid, pieces.row, pieces.start, pieces.stop)
+    first = np.searchsorted(blocks.owner, np.arange(len(pieces.row) + 1))
+    price = PRICE * np.where(pieces.curved, 3.0, 2.0)
+    chi, count = np.zeros(len(pieces.row)), np.zeros(len(pieces.row))
+    size = np.where(pieces.curved, 3, 2)
+    for k in range(len(pieces.row)):
+        part = blocks.pick(np.arange(first[k], first[k + 1]))
+        chi[k], count[k] = _own_chi(part, int(size[k]), grid.sigma), part.counts.sum()
+    inflation = _inflation(chi, np.diff(first) - size)
+    return Context(
+        pieces, blocks, first, chi / inflation, price, count, _neighbours(pieces), grid.sigma * np.sqrt(inflation)
+    )
+
+
+def _inflation(chi: Array, freedom: IntArray) -> float:
+    """Variance of block means over that of white noise, 1 or more: real noise is alike in neighbouring beams."""
+    known = freedom >= 4
+    if np.count_nonzero(known) < 5:
+        return 1.0
+    ratio, weight = chi[known] / freedom[known], freedom[known]
+    order = np.argsort(ratio)
+    half = np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum())
+    return float(max(1.0, ratio[order][half]))
+
+
+def _own_chi(part: Blocks, size: int, sigma: float) -> float:
+    """Chi square of a piece's blocks about its own line, in w = 1/range over the angle to the middle beam."""
+    if len(part.counts) <= size:
+        return 0.0
+    origin = part.points.mean(axis=0)
+    chord = part.points[-1] - part.points[0]
+    chord = chord / np.linalg.norm(chord)
+    along = (part.points - origin) @ chord
+    normal = np.cross(np.cross(chord, part.directions.mean(axis=0)), chord)
+    normal /= np.linalg.norm(normal)
+    height = (part.points - origin) @ normal
+    root = np.sqrt(part.counts) / sigma / np.maximum(np.abs(part.directions @ normal), 0.05)
+    N = np.vander(along, size, increasing=True) * root[:, None]
+    x = np.linalg.lstsq(N, height * root, rcond=1e-10)[0]
+    return float(np.sum((N @ x - height * root) ** 2))
+
+
+def _neighbours(pieces: Pieces) -> list[list[int]]:
+    """For each piece those one or two scans away whose beams overlap its own."""
+    out: list[list[int]] = [[] for _ in pieces.row]
+    rows = int(pieces.row.max(initial=-1)) + 1
+    bounds = np.searchsorted(pieces.row, np.arange(rows + 1))
+    for step in (1, 2):
+        for row in range(rows - step):
+            a, b = (np.arange(bounds[r], bounds[r + 1]) for r in (row, row + step))
+            common = np.minimum(pieces.stop[a][:, None], pieces.stop[b]) - np.maximum(
+                pieces.start[a][:, None], pieces.start[b]
+            )
+            shorter = np.minimum((pieces.stop - pieces.start)[a][:, None], (pieces.stop - pieces.start)[b])
+            for i, j in np.argwhere(common >= np.maximum(2, LEAST_OVERLAP * shorter)):
+                out[a[i]].append(int(b[j]))
+                out[b[j]].append(int(a[i]))
+    return out
+
+
+def joint_excess(context: Context, members: list[int], sums: Sums, size: int) -> float:
+    """By how much a joint surface is worse than the pieces apart, prices and slack included; negative: better."""
+    apart = sum(context.chi[k] + context.price[k] + context.slack * context.beams[k] for k in members)
+    return chi_square(sums, size) + PRICE * size - float(apart)

@@ -1,0 +1,138 @@
+"""Faces of a data set: beams divided into smooth surfaces, each fitted as a height field over its own base."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bsmap_cli.fit.beams import BeamGrid
+from bsmap_cli.fit.blocks import Blocks, make_blocks
+from bsmap_cli.fit.crossings import find_crossings
+from bsmap_cli.fit.heights import Base, CylinderBase, plane_base
+from bsmap_cli.fit.labels import adopt, drop_outliers, move_breaks, runs_of
+from bsmap_cli.fit.lowmodels import fit_cylinder_frame, fit_plane_frame
+from bsmap_cli.fit.pieces import find_pieces
+from bsmap_cli.fit.regions import find_regions
+from bsmap_cli.fit.selection import Fitted, fit_heights, refit
+from bsmap_cli.fit.unions import low_order_cost
+from bsmap_cli.model import Array, IntArray
+
+FEWEST_BEAMS = 20
+"""Of a face; what is smaller is left to the rest."""
+FARTHEST = 1.0
+"""Metres by which a face's rectangle may grow towards its creases."""
+ROUNDS = 2
+"""Of dividing the beams anew by the fitted surfaces."""
+
+
+class Faces(NamedTuple):
+    """Faces of a data set.
+
+    labels : (m, n) number of the face of each beam, -1 for the rest; a beam without return between beams of one face
+    has that face's number.  sigma : metres, noise along the beam that block means show, in terms of single beams.
+    """
+
+    labels: IntArray
+    fitted: list[Fitted]
+    sigma: float
+
+
+def find_faces(grid: BeamGrid) -> Faces:
+    """Divide the beams into faces and fit each."""
+    pieces = find_pieces(grid)
+    regions, sigma = find_regions(grid, pieces)
+    labels = np.full(grid.ranges.shape, -1)
+    for number, members in enumerate(regions):
+        for k in members:
+            labels[pieces.row[k], pieces.start[k] : pieces.stop[k]] = number
+    labels = _renumber(labels, grid)
+    fitted = _fit_all(grid, labels, sigma)
+    for _ in range(ROUNDS):
+        fields = [f.field for f in fitted]
+        labels = drop_outliers(grid, labels, fields, sigma)
+        labels = adopt(grid, labels, fields, sigma)
+        labels = move_breaks(grid, labels, fields, sigma)
+        labels, kept = _kept(labels, grid)
+        fitted = [
+            refit(fields[k], blocks, sigma) for k, blocks in zip(kept, blocks_of_faces(grid, labels), strict=True)
+        ]
+    return Faces(labels, _widened(grid, labels, fitted, sigma), sigma)
+
+
+def _widened(grid: BeamGrid, labels: IntArray, fitted: list[Fitted], sigma: float) -> list[Fitted]:
+    """Faces fitted anew on rectangles that hold their creases, where the old ones do not."""
+    crossings = find_crossings(grid, labels, [f.field for f in fitted])
+    out = []
+    for number, (old, blocks) in enumerate(zip(fitted, blocks_of_faces(grid, labels), strict=True)):
+        field = old.field
+        at = field.base.local(crossings.points[np.any(crossings.faces == number, axis=1)])[:, :2]
+        low = np.maximum(np.vstack([at, field.low]).min(axis=0), field.low - FARTHEST)
+        high = np.minimum(np.vstack([at, field.high]).max(axis=0), field.high + FARTHEST)
+        if np.any(low < field.low) or np.any(high > field.high):
+            margin = 0.02 * (high - low)
+            field = field._replace(
+                low=np.where(low < field.low, low - margin, low), high=np.where(high > field.high, high + margin, high)
+            )
+            old = refit(field, blocks, sigma)
+        out.append(old)
+    return out
+
+
+def _renumber(labels: IntArray, grid: BeamGrid) -> IntArray:
+    return _kept(labels, grid)[0]
+
+
+def _kept(labels: IntArray, grid: BeamGrid) -> tuple[IntArray, IntArray]:
+    """Labels without the faces of too few beams or scans, numbered anew; and the old numbers."""
+    number = int(labels.max(initial=-1)) + 1
+    beams = np.bincount(labels[grid.hit & (labels >= 0)], minlength=number)
+    scans = np.array([np.count_nonzero(np.any((labels == k) & grid.hit, axis=1)) for k in range(number)], dtype=int)
+    kept = np.flatnonzero((beams >= FEWEST_BEAMS) & (scans >= 3))
+    new = np.full(number + 1, -1)
+    new[kept] = np.arange(len(kept))
+    return new[labels], kept
+
+
+def blocks_of_faces(grid: BeamGrid, labels: IntArray) -> list[Blocks]:
+    """Blocks of each face."""
+    runs = runs_of(labels)
+    blocks = make_blocks(grid, runs.row, runs.start, runs.stop)
+    of_face = runs.label[blocks.owner]
+    return [blocks.pick(of_face == k) for k in range(int(labels.max(initial=-1)) + 1)]
+
+
+def _fit_all(grid: BeamGrid, labels: IntArray, sigma: float) -> list[Fitted]:
+    fitted = []
+    for number, blocks in enumerate(blocks_of_faces(grid, labels)):
+        base = choose_base(blocks, sigma)
+        low, high = _rectangle(grid, labels == number, base)
+        fitted.append(fit_heights(blocks, base, low, high, sigma))
+    return fitted
+
+
+def choose_base(blocks: Blocks, sigma: float) -> Base:
+    """Plane, or vertical cylinder where that is what the blocks lie on."""
+    frame = fit_plane_frame(blocks)
+    if low_order_cost(blocks, frame, sigma).is_round:
+        found = fit_cylinder_frame(blocks)
+        if found is not None:
+            angles = np.arctan2(*(blocks.points[:, :2] - found.centre).T[::-1])
+            middle = float(np.angle(np.mean(np.exp(1j * angles))))
+            return CylinderBase(found.centre, found.radius, middle)
+    return plane_base(blocks.points, frame.axes[:, 2])
+
+
+def _rectangle(grid: BeamGrid, member: NDArray[np.bool_], base: Base) -> tuple[Array, Array]:
+    """Corners (2,) in s and t of the rectangle around a face's beams, with room for a cell of the grid beyond them."""
+    st = np.full((*grid.hit.shape, 2), np.nan)
+    inside = member & grid.hit
+    st[inside] = base.local(grid.points[inside])[:, :2]
+    low, high = np.nanmin(st, axis=(0, 1)), np.nanmax(st, axis=(0, 1))
+    margin = np.full(2, 0.02)
+    for axis in (0, 1):
+        steps = np.abs(np.diff(st, axis=axis)).reshape(-1, 2)
+        steps = steps[np.isfinite(steps[:, 0])]
+        if len(steps):
+            margin = np.maximum(margin, 1.2 * np.percentile(steps, 95, axis=0))
+    margin = np.minimum(margin, 0.6)
+    return low - margin, high + margin

@@ -1,0 +1,193 @@
+"""Height fields over a base, fitted along the beams: h(s, t), a tensor-product spline, over a plane or a cylinder.
+
+The noise lies along the beam, so the residual is measured along it and the parameters are those of the beam's foot on
+the model, not of the noisy point. One Gauss-Newton step is a linear least-squares problem in the heights.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from bsmap_cli.core.bspline import TensorSpline, clamped_knots, design_matrix, evaluate_surface, inner_knots
+from bsmap_cli.fit.lowmodels import axes_of
+from bsmap_cli.model import Array
+
+STEEPEST = 0.05
+"""Smallest sine between beam and surface that counts."""
+
+
+class PlaneBase(NamedTuple):
+    """origin (3,), axes (3, 3) in map: columns along s, along t, normal."""
+
+    origin: Array
+    axes: Array
+
+    def local(self, points: Array) -> Array:
+        """(..., 3) s, t, h of points (..., 3)."""
+        return (points - self.origin) @ self.axes
+
+    def turn(self, local: Array, directions: Array) -> Array:
+        """(..., 3) change of s, t, h along unit directions (..., 3) at places `local`."""
+        return directions @ self.axes
+
+    def place(self, local: Array) -> Array:
+        """Points (..., 3) in map of s, t, h (..., 3)."""
+        return self.origin + local @ self.axes.T
+
+
+class CylinderBase(NamedTuple):
+    """Vertical cylinder: s is the arc's length from the angle `middle`, t the height z, h the distance outwards."""
+
+    centre: Array
+    radius: float
+    middle: float
+
+    def local(self, points: Array) -> Array:
+        x, y = points[..., 0] - self.centre[0], points[..., 1] - self.centre[1]
+        angle = (np.arctan2(y, x) - self.middle + np.pi) % (2.0 * np.pi) - np.pi
+        return np.stack([angle * self.radius, points[..., 2], np.hypot(x, y) - self.radius], axis=-1)
+
+    def turn(self, local: Array, directions: Array) -> Array:
+        angle = local[..., 0] / self.radius + self.middle
+        c, s = np.cos(angle), np.sin(angle)
+        outwards = directions[..., 0] * c + directions[..., 1] * s
+        around = directions[..., 1] * c - directions[..., 0] * s
+        distance = np.maximum(self.radius + local[..., 2], 0.1 * self.radius)
+        return np.stack([around * self.radius / distance, directions[..., 2], outwards], axis=-1)
+
+    def place(self, local: Array) -> Array:
+        angle, distance = local[..., 0] / self.radius + self.middle, self.radius + local[..., 2]
+        x, y = self.centre[0] + distance * np.cos(angle), self.centre[1] + distance * np.sin(angle)
+        return np.stack([x, y, local[..., 1]], axis=-1)
+
+
+Base = PlaneBase | CylinderBase
+
+
+class Knots(NamedTuple):
+    """Degrees and clamped knots on [0, 1] of a height field."""
+
+    degree_s: int
+    degree_t: int
+    s: Array
+    t: Array
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Control points along s and t."""
+        return len(self.s) - self.degree_s - 1, len(self.t) - self.degree_t - 1
+
+    @property
+    def size(self) -> int:
+        """Number of control points."""
+        return self.shape[0] * self.shape[1]
+
+
+def flat_knots() -> Knots:
+    """The least surface: bilinear, without inner knots."""
+    return Knots(1, 1, np.array([0.0, 0.0, 1.0, 1.0]), np.array([0.0, 0.0, 1.0, 1.0]))
+
+
+class HeightField(NamedTuple):
+    """Heights over a base on the rectangle from `low` (2,) to `high` (2,) in s and t, metres; heights (ns, nt)."""
+
+    base: Base
+    low: Array
+    high: Array
+    knots: Knots
+    heights: Array
+
+    def parameters(self, local: Array) -> Array:
+        """(n, 2) u, v in [0, 1] inside the rectangle, beyond it outside, of s, t, h (n, 3)."""
+        return (local[:, :2] - self.low) / (self.high - self.low)
+
+
+class Feet(NamedTuple):
+    """Where beams meet a height field.
+
+    uv : (n, 2) parameters, not clamped.  beyond : (n,) metres from the measured point on to the foot, along the beam.
+    slope : (n,) change of height over the surface along the beam.  points : (n, 3) in map.
+    """
+
+    uv: Array
+    beyond: Array
+    slope: Array
+    points: Array
+
+
+def evaluate(field: HeightField, uv: Array) -> tuple[Array, Array]:
+    """Heights (n,) and their gradients (n, 2) by s and t; beyond the rectangle the surface goes on straight."""
+    k = field.knots
+    inside = np.clip(uv, 0.0, 1.0)
+    spline = TensorSpline(k.degree_s, k.degree_t, k.s, k.t, field.heights[:, :, None])
+    value, by_u, by_v = evaluate_surface(spline, inside[:, 0], inside[:, 1], 1)[:, :, 0]
+    gradient = np.stack([by_u, by_v], axis=1)
+    height = value + np.sum(gradient * (uv - inside), axis=1)
+    return height, gradient / (field.high - field.low)
+
+
+def find_feet(field: HeightField, points: Array, directions: Array, steps: int = 3) -> Feet:
+    """Feet of beams through points (n, 3) along unit directions (n, 3), by Newton's method from the points."""
+    beyond = np.zeros(len(points))
+    for step in range(steps + 1):
+        local = field.base.local(points + beyond[:, None] * directions)
+        uv = field.parameters(local)
+        height, gradient = evaluate(field, uv)
+        turn = field.base.turn(local, directions)
+        slope = turn[:, 2] - np.sum(gradient * turn[:, :2], axis=1)
+        slope = np.where(np.abs(slope) < STEEPEST, np.where(slope < 0.0, -STEEPEST, STEEPEST), slope)
+        if step < steps:
+            beyond = beyond - np.clip((local[:, 2] - height) / slope, -5.0, 5.0)
+    return Feet(uv, beyond, slope, points + beyond[:, None] * directions)
+
+
+def offset(field: HeightField, points: Array) -> tuple[Array, Array]:
+    """Heights (n,) of points (n, 3) above the field, to first order their distances, and unit normals (n, 3) there."""
+    local = field.base.local(points)
+    height, gradient = evaluate(field, field.parameters(local))
+    # turn() of the axes of map gives the derivatives of s, t, h by x, y, z.
+    by_axis = np.stack([field.base.turn(local, np.broadcast_to(axis, points.shape)) for axis in np.eye(3)], axis=1)
+    slope = by_axis[:, :, 2] - np.einsum("nak,nk->na", by_axis[:, :, :2], gradient)
+    length = np.linalg.norm(slope, axis=1, keepdims=True)
+    return (local[:, 2] - height) / length[:, 0], slope / length
+
+
+def plane_base(points: Array, normal: Array) -> PlaneBase:
+    """Plane base at the middle of points (n, 3), its axes turned to the smallest rectangle around them, or level."""
+    origin = points.mean(axis=0)
+    axes = axes_of(normal)
+    flat = (points - origin) @ axes[:, :2]
+    areas = []
+    angles = np.radians(np.arange(0.0, 90.0, 3.0))
+    for angle in angles:
+        c, s = np.cos(angle), np.sin(angle)
+        areas.append(np.ptp(flat @ [c, s]) * np.ptp(flat @ [-s, c]))
+    # Walls stay level unless another rectangle is much smaller.
+    best = int(np.argmin(areas))
+    if abs(axes[2, 2]) < 0.9 and areas[best] > 0.8 * areas[0]:
+        best = 0
+    c, s = np.cos(angles[best]), np.sin(angles[best])
+    return PlaneBase(origin, axes @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]))
+
+
+def basis_matrix(knots: Knots, uv: Array) -> Array:
+    """(n, ns * nt) products of the basis functions at parameters (n, 2), clamped to [0, 1]."""
+    inside = np.clip(uv, 0.0, 1.0)
+    along_s = design_matrix(knots.s, knots.degree_s, inside[:, 0])
+    along_t = design_matrix(knots.t, knots.degree_t, inside[:, 1])
+    return (along_s[:, :, None] * along_t[:, None, :]).reshape(len(uv), -1)
+
+
+def greville(knots: Array, degree: int) -> Array:
+    """(n,) parameters at which control points of a straight line lie evenly with it."""
+    return np.array([knots[i + 1 : i + 1 + degree].mean() for i in range(len(knots) - degree - 1)])
+
+
+def with_degree(knots: Array, degree: int) -> Array:
+    """Clamped knots of one degree more, the inner ones as often as before: smoother than raising it exactly."""
+    return clamped_knots(degree + 1, inner_knots(knots, degree))
+
+
+def with_knot(knots: Array, degree: int, new: float) -> Array:
+    """Clamped knots with one more."""
+    return clamped_knots(degree, np.append(inner_knots(knots, degree), new))

@@ -1,0 +1,185 @@
+"""Pieces of scan lines: stretches of beams that hit one straight or gently curved line.
+
+In w = 1/range over the beam's angle a straight line is linear in {cos, sin}; adding 1 makes a conic with its focus in
+the sensor, which follows gentle curves. With prefix sums of the moments the best line or conic of any interval of beams
+costs the same small work. Breaks are found by dynamic programming over candidates, then moved to their best place.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bsmap_cli.fit.beams import BeamGrid
+from bsmap_cli.model import Array, IntArray
+
+LINE_COST, CONIC_COST = 25.0, 37.0
+"""Price of a piece in units of chi square: its parameters and its place among some hundred beams."""
+JUNK_COST, JUNK_BEAM = 15.0, 8.0
+"""Price of a stretch of beams that belongs to no line, and of each of its beams."""
+FEWEST, FEWEST_CONIC = 4, 12
+"""Beams of a line and of a conic."""
+WINDOWS = (5, 10, 20, 40)
+CANDIDATE = 12.0
+"""Gain in chi square of two lines over one that makes a place a candidate for a break."""
+WIDEST_GAP = 3
+"""Beams without return that a piece may bridge."""
+
+
+class Pieces(NamedTuple):
+    """Stretches of beams: row (k,), first beam (k,), beam behind the last one (k,), whether curved (k,)."""
+
+    row: IntArray
+    start: IntArray
+    stop: IntArray
+    curved: NDArray[np.bool_]
+
+
+def find_pieces(grid: BeamGrid) -> Pieces:
+    """Pieces of all scan lines, scan after scan; what fits no line is in none."""
+    moments = _prefix_moments(grid)
+    gain = _break_gain(moments)
+    found = []
+    for row in range(len(grid.ranges)):
+        for first, last in _stretches(grid.hit[row]):
+            places = _candidates(grid, gain[:, row], row, first, last)
+            found += [(row, *piece) for piece in _divide(moments[row], places)]
+    if not found:
+        none = np.zeros(0, dtype=np.int64)
+        return Pieces(none, none, none, np.zeros(0, dtype=bool))
+    table = np.array(found, dtype=np.int64)
+    pieces = Pieces(table[:, 0], table[:, 1], table[:, 2], table[:, 3].astype(bool))
+    for _ in range(2):
+        pieces = _relocate(grid, moments, pieces)
+    return pieces
+
+
+def _prefix_moments(grid: BeamGrid) -> Array:
+    """(m, n + 1, 11) sums over beams before each: W {cc, cs, ss, c, s, 1}, W w {c, s, 1}, W w^2, number of returns."""
+    m, n = grid.ranges.shape
+    r = np.where(grid.hit, grid.ranges, 1.0)
+    W = np.where(grid.hit, r**4 / grid.sigma**2, 0.0)
+    w, c, s = 1.0 / r, np.cos(grid.angles), np.sin(grid.angles)
+    terms = np.stack(
+        [W * c * c, W * c * s, W * s * s, W * c, W * s, W, W * w * c, W * w * s, W * w, W * w * w, grid.hit * 1.0], -1
+    )
+    out = np.zeros((m, n + 1, 11))
+    np.cumsum(terms, axis=1, out=out[:, 1:])
+    return out
+
+
+def _chi_line(d: Array) -> Array:
+    """Chi square (...) of the best line by moments (..., 11)."""
+    cc, cs, ss, wc, ws, ww = d[..., 0], d[..., 1], d[..., 2], d[..., 6], d[..., 7], d[..., 9]
+    determinant = cc * ss - cs * cs
+    explained = (ss * wc * wc - 2.0 * cs * wc * ws + cc * ws * ws) / np.where(determinant > 0.0, determinant, 1.0)
+    return np.where((d[..., 10] >= 2) & (determinant > 0.0), np.maximum(ww - explained, 0.0), 0.0)
+
+
+def _normal(d: Array, size: int) -> tuple[Array, Array]:
+    """Normal matrices (..., size, size) and right sides (..., size) of lines (2) and conics (3)."""
+    A = d[..., [[0, 1, 3], [1, 2, 4], [3, 4, 5]]][..., :size, :size]
+    return A, d[..., 6 : 6 + size]
+
+
+def _chi_conic(d: Array) -> Array:
+    A, b = _normal(d, 3)
+    x = np.linalg.solve(A + 1e-12 * np.trace(A, axis1=-2, axis2=-1)[..., None, None] * np.eye(3), b[..., None])[..., 0]
+    return np.asarray(np.maximum(d[..., 9] - np.sum(b * x, axis=-1), 0.0))
+
+
+def _break_gain(moments: Array) -> Array:
+    """(windows, m, n + 1) gain in chi square of a break before each beam, at several half windows."""
+    n = moments.shape[1] - 1
+    at = np.arange(n + 1)
+    out = []
+    for half in WINDOWS:
+        low, high = np.maximum(at - half, 0), np.minimum(at + half, n)
+        left, right = moments - moments[:, low], moments[:, high] - moments
+        gain = _chi_line(left + right) - _chi_line(left) - _chi_line(right)
+        out.append(np.where((left[..., 10] >= 3) & (right[..., 10] >= 3), gain, 0.0))
+    return np.array(out)
+
+
+def _stretches(hit: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Ranges (first, stop) of beams between gaps too wide to bridge."""
+    at = np.flatnonzero(hit)
+    if len(at) == 0:
+        return []
+    wide = np.flatnonzero(np.diff(at) > WIDEST_GAP + 1)
+    first, last = np.concatenate([[0], wide + 1]), np.concatenate([wide, [len(at) - 1]])
+    return [(int(at[a]), int(at[b]) + 1) for a, b in zip(first, last, strict=True)]
+
+
+def _candidates(grid: BeamGrid, gain: Array, row: int, first: int, stop: int) -> IntArray:
+    """Places of possible breaks in a stretch, both ends among them: peaks of the gain, jumps of range."""
+    places = [np.array([first, stop])]
+    for half, g in zip(WINDOWS, gain[:, first : stop + 1], strict=True):
+        reach = max(2, half // 4)
+        padded = np.pad(g, reach, constant_values=-1.0)
+        peak = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1).max(axis=1)
+        places.append(first + np.flatnonzero((g >= peak) & (g > CANDIDATE)))
+    r = grid.ranges[row, first:stop]
+    step = np.abs(np.diff(r))
+    around = np.nanmedian(step) if len(step) else 0.0
+    places.append(first + 1 + np.flatnonzero(step > 8.0 * grid.sigma + 3.0 * around))
+    return np.unique(np.concatenate(places))
+
+
+def _divide(moments: Array, places: IntArray) -> list[tuple[int, int, bool]]:
+    """Cheapest division of the stretch between the first and the last place into lines, conics and junk."""
+    at = moments[places]
+    i, j = np.triu_indices(len(places), 1)
+    d = at[j] - at[i]
+    count = d[:, 10]
+    line = np.where(count >= FEWEST, _chi_line(d) + LINE_COST, np.inf)
+    conic = np.full(len(i), np.inf)
+    # A conic is worth a look only where it could be cheaper than the line.
+    look = (count >= FEWEST_CONIC) & (line - LINE_COST > CONIC_COST - LINE_COST)
+    if look.any():
+        conic[look] = _chi_conic(d[look]) + CONIC_COST
+    junk = JUNK_COST + JUNK_BEAM * count
+    kind = np.argmin([line, conic, junk], axis=0)
+    costs = np.full((len(places), len(places)), np.inf)
+    costs[i, j] = np.min([line, conic, junk], axis=0)
+    kinds = np.zeros(costs.shape, dtype=int)
+    kinds[i, j] = kind
+    best, before = np.zeros(len(places)), np.zeros(len(places), dtype=int)
+    for k in range(1, len(places)):
+        total = best[:k] + costs[:k, k]
+        before[k] = np.argmin(total)
+        best[k] = total[before[k]]
+    out, k = [], len(places) - 1
+    while k > 0:
+        b = int(before[k])
+        if kinds[b, k] < 2:
+            out.append((int(places[b]), int(places[k]), bool(kinds[b, k] == 1)))
+        k = b
+    return out[::-1]
+
+
+def _relocate(grid: BeamGrid, moments: Array, pieces: Pieces) -> Pieces:
+    """Move the breaks between touching pieces to where the two models together fit best."""
+    d = moments[pieces.row, pieces.stop] - moments[pieces.row, pieces.start]
+    models = np.zeros((len(d), 3))
+    A, b = _normal(d, 2)
+    models[:, :2] = np.linalg.solve(A, b[..., None])[..., 0]
+    if pieces.curved.any():
+        A, b = _normal(d[pieces.curved], 3)
+        models[pieces.curved] = np.linalg.solve(A, b[..., None])[..., 0]
+    start, stop = pieces.start.copy(), pieces.stop.copy()
+    basis = np.stack([np.cos(grid.angles), np.sin(grid.angles), np.ones(len(grid.angles))])
+    touching = (pieces.row[1:] == pieces.row[:-1]) & (pieces.start[1:] == pieces.stop[:-1])
+    for k in np.flatnonzero(touching):
+        low = max(start[k] + FEWEST, stop[k] - 10)
+        high = min(pieces.stop[k + 1] - FEWEST, pieces.start[k + 1] + 10)
+        if high <= low:
+            continue
+        span = slice(low, high)
+        r = grid.ranges[pieces.row[k], span]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            e = np.minimum(np.abs(r - 1.0 / (models[k : k + 2] @ basis[:, span])), 10.0 * grid.sigma) ** 2
+        e = np.where(np.isfinite(e), e, 0.0)
+        total = np.concatenate([[0.0], np.cumsum(e[0])]) + np.concatenate([np.cumsum(e[1][::-1])[::-1], [0.0]])
+        stop[k] = start[k + 1] = low + int(np.argmin(total))
+    return Pieces(pieces.row, start, stop, pieces.curved)

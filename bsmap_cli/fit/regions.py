@@ -1,0 +1,68 @@
+"""Regions of pieces that lie on one smooth surface, grown over neighbouring scans, then merged.
+
+After Jiang and Bunke (1994, "Fast segmentation of range images into planar regions by scan line grouping") with
+surfaces of higher order and a statistical criterion: a piece joins where that raises chi square by less than its own
+parameters are worth.
+"""
+
+from collections import deque
+
+import numpy as np
+
+from bsmap_cli.fit.beams import BeamGrid
+from bsmap_cli.fit.context import PRICE, Context, make_context
+from bsmap_cli.fit.lowmodels import ORDERS, Frame, PlaneFrame, chi_square, sums_of
+from bsmap_cli.fit.pieces import Pieces
+from bsmap_cli.fit.seeds import bent_seeds, cylinder_seeds, plane_seeds
+from bsmap_cli.fit.unions import unite_regions
+from bsmap_cli.model import IntArray
+
+
+def find_regions(grid: BeamGrid, pieces: Pieces) -> tuple[list[list[int]], float]:
+    """Numbers of the pieces of each region, largest region first; pieces of no region are left out.
+
+    Also the noise along the beam that block means show, metres: that of single beams, or more where it is not white.
+    """
+    context = make_context(grid, pieces)
+    owner = np.full(len(pieces.row), -1)
+    regions: list[list[int]] = []
+    for find in (plane_seeds, bent_seeds, cylinder_seeds):
+        for seed, frame in find(context, owner):
+            if np.any(owner[seed] >= 0):
+                continue
+            grown = _grow(context, owner, seed, frame)
+            owner[grown] = len(regions)
+            regions.append(grown)
+    return unite_regions(context, regions), context.sigma
+
+
+def _sizes(frame: Frame, rows: int) -> tuple[int, ...]:
+    """Orders allowed for a region over a number of scans: the data must be able to contradict it across the scans."""
+    if not isinstance(frame, PlaneFrame):
+        return (3,)
+    return tuple(size for size, least in zip(ORDERS, (1, 5, 8, 12), strict=True) if rows >= least)[:3]
+
+
+def _grow(context: Context, owner: IntArray, seed: list[int], frame: Frame) -> list[int]:
+    """Pieces that the seed's surface reaches, scan by scan, its order rising as the data ask for it."""
+    members, rows = list(seed), {int(context.pieces.row[k]) for k in seed}
+    sums = sums_of(frame, context.blocks_of(seed), context.sigma)
+    taken = set(seed)
+    cost = min(chi_square(sums, size) + PRICE * size for size in _sizes(frame, len(rows)))
+    waiting = deque(k for member in seed for k in context.neighbours[member])
+    tries: dict[int, int] = {}
+    while waiting:
+        k = waiting.popleft()
+        if k in taken or owner[k] >= 0 or tries.get(k, 0) > 3:
+            continue
+        tries[k] = tries.get(k, 0) + 1
+        more = sums.plus(sums_of(frame, context.blocks_of([k]), context.sigma))
+        sizes = _sizes(frame, len(rows | {int(context.pieces.row[k])}))
+        joint = min(chi_square(more, size) + PRICE * size for size in sizes)
+        if joint < cost + context.chi[k] + context.price[k] + context.slack * context.beams[k]:
+            members.append(k)
+            taken.add(k)
+            rows.add(int(context.pieces.row[k]))
+            sums, cost = more, joint
+            waiting.extend(context.neighbours[k])
+    return members

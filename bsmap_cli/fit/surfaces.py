@@ -1,0 +1,86 @@
+"""B-spline surface in map of a fitted height field, with the covariance of its heights."""
+
+import numpy as np
+
+from bsmap_cli.core.bspline import TensorSpline, clamped_knots, design_matrix, inner_knots
+from bsmap_cli.fit.heights import CylinderBase, HeightField, Knots, PlaneBase, greville
+from bsmap_cli.fit.selection import Fitted
+from bsmap_cli.model import Array, HeightCovariance, PosePart
+
+WIDEST_ARC = 0.7
+"""Radians of a cylinder that one cubic span follows."""
+ARC_ERROR = 2e-4
+"""Metres by which cubic spans may leave a cylinder, by a bound that least squares stays well below."""
+
+
+def spline_of(fitted: Fitted, pose: tuple[PosePart, ...]) -> tuple[TensorSpline, HeightCovariance]:
+    """Surface in map with its covariance.
+
+    A height field over a plane is a B-spline surface as it stands. One over a cylinder is approximated by a spline that
+    is cubic around the axis.
+    """
+    field = fitted.field
+    if isinstance(field.base, PlaneBase):
+        k = field.knots
+        points = field.base.place(_net(field, field.heights))
+        covariance = HeightCovariance(field.base.axes[None, None, :, 2], _inverse(fitted.information), pose)
+        return TensorSpline(k.degree_s, k.degree_t, k.s, k.t, points), covariance
+    return _over_cylinder(fitted, field.base, pose)
+
+
+def _net(field: HeightField, heights: Array) -> Array:
+    """(ns, nt, 3) s, t, h of the control points: s and t at the Greville abscissae."""
+    k = field.knots
+    s, t = greville(k.s, k.degree_s), greville(k.t, k.degree_t)
+    out = np.empty((*k.shape, 3))
+    out[..., 0] = (field.low[0] + s * (field.high[0] - field.low[0]))[:, None]
+    out[..., 1] = field.low[1] + t * (field.high[1] - field.low[1])
+    out[..., 2] = heights
+    return out
+
+
+def _inverse(information: Array) -> Array:
+    scale = 1.0 / np.sqrt(np.diag(information))
+    inverse = np.linalg.inv(information * scale[:, None] * scale)
+    inverse = inverse * scale[:, None] * scale
+    return (inverse + inverse.T) / 2.0
+
+
+def _over_cylinder(
+    fitted: Fitted, base: CylinderBase, pose: tuple[PosePart, ...]
+) -> tuple[TensorSpline, HeightCovariance]:
+    """Cubic around, by least squares through the height field, and exact upwards.
+
+    The control points depend linearly on the heights: what they move outwards gives the covariance.
+    """
+    field = fitted.field
+    knots = _cubic_around(field, base)
+    u = np.linspace(0.0, 1.0, 20 * knots.shape[0])
+    around = design_matrix(field.knots.s, field.knots.degree_s, u)
+    net = np.empty((len(u), knots.shape[1], 3))
+    net[..., 0] = (field.low[0] + u * (field.high[0] - field.low[0]))[:, None]
+    net[..., 1] = field.low[1] + greville(knots.t, knots.degree_t) * (field.high[1] - field.low[1])
+    net[..., 2] = around @ field.heights
+    solve = np.linalg.pinv(design_matrix(knots.s, knots.degree_s, u))  # (ns, k)
+    points = np.asarray(solve @ base.place(net).reshape(len(u), -1)).reshape(*knots.shape, 3)
+    outwards, directions = (_outwards(field, base, at) for at in (u, greville(knots.s, knots.degree_s)))
+    by_heights = (solve * (directions @ outwards.T)) @ around
+    M = np.kron(by_heights, np.eye(knots.shape[1]))
+    covariance = HeightCovariance(directions[:, None], M @ _inverse(fitted.information) @ M.T, pose)
+    return TensorSpline(knots.degree_s, knots.degree_t, knots.s, knots.t, points), covariance
+
+
+def _outwards(field: HeightField, base: CylinderBase, u: Array) -> Array:
+    """(n, 3) unit vectors away from the axis at parameters u (n,)."""
+    angle = base.middle + (field.low[0] + u * (field.high[0] - field.low[0])) / base.radius
+    return np.stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))], axis=-1)
+
+
+def _cubic_around(field: HeightField, base: CylinderBase) -> Knots:
+    """Knots that follow the arc: a cubic span of angle a leaves it by about a^4 / 384 of the radius."""
+    k = field.knots
+    arc = (field.high[0] - field.low[0]) / base.radius
+    widest = min(WIDEST_ARC, (384.0 * ARC_ERROR / base.radius) ** 0.25)
+    spans = max(1, int(np.ceil(arc / widest)))
+    inner = np.union1d(np.round(inner_knots(k.s, k.degree_s), 10), np.round(np.arange(1, spans) / spans, 10))
+    return Knots(3, k.degree_t, clamped_knots(3, inner), k.t)

@@ -1,0 +1,152 @@
+"""Data sets of known truth for the fit of faces: a corridor with recess, pillar and bowed wall; a real room."""
+
+import gzip
+from dataclasses import replace
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from scenes import simulated, true_slam_map
+
+from bsmap_cli.cloud import make_cloud
+from bsmap_cli.core import se2
+from bsmap_cli.evaluate import transform_points
+from bsmap_cli.model import PointCloud, SlamMap, Trajectory
+from bsmap_cli.params import CloudParams, SimulateParams
+from bsmap_cli.simulate import robot
+from bsmap_cli.simulate.geometry import arc, carve, join, room, upright
+from bsmap_cli.simulate.path import Path
+from bsmap_cli.simulate.raycast import Caster
+from bsmap_cli.simulate.scenes import Scene
+from bsmap_cli.simulate.simulation import scan
+
+REAL_ROOM = "/work/shared/data/scans/room_scan1.pcd.gz"
+
+
+class Place(NamedTuple):
+    """A cloud at true poses, and the truth: the scene's mesh, moved into map.
+
+    clean : (n, 3) m, the cloud's points without noise.
+    """
+
+    cloud: PointCloud
+    vertices: np.ndarray
+    triangles: np.ndarray
+    clean: np.ndarray
+
+
+def corridor_mesh():
+    """Corridor along x: a recess in the ceiling, half a pillar at one wall, the other wall bowed (radius 6 m)."""
+    boxes = carve([room(-6.0, 8.0, -0.5, 2.2, 0.0, 2.6), room(0.55, 1.45, 0.6, 1.7, 2.6, 2.85)])
+    half = np.arcsin(4.5 / 6.0)
+    bowed = upright(arc((1.0, 5.7), 6.0, -np.pi / 2 + half, -np.pi / 2 - half), 0.0, 2.6)
+    pillar = upright(arc((1.2, 2.2), 0.3, -np.pi, 0.0, np.radians(1.0)), 0.0, 2.6)
+    return join([boxes, bowed, pillar])
+
+
+@cache
+def caster():
+    return Caster(corridor_mesh())
+
+
+def corridor_set(sigma=0.01, seed=0, scans=20, beams=541):
+    """A translation of 1.9 m in `scans` scans."""
+    mesh = corridor_mesh()
+    length = 1.9
+    time = np.linspace(0.0, length, scans)
+    path = Path(np.array([0.0, 3.0]), np.array([[0.0, 1.0, 0.0], [3.0, 1.0, 0.0]]), np.array([[1.0, 0.0]]))
+    scene = Scene(mesh, path, time)
+    laser = replace(robot.VERTICAL, beams=beams)
+    noisy = scan(laser, scene, caster(), SimulateParams(range_sigma=sigma), np.random.default_rng(seed))
+    clean = scan(laser, scene, caster(), SimulateParams(range_sigma=0.0), np.random.default_rng(seed))
+    poses = np.column_stack([time, np.ones(scans), np.zeros(scans)])
+    trajectory = Trajectory(noisy.time_ns, poses, np.zeros((scans, 3, 3)))
+    slam_map = true_slam_map(simulated("room"))
+    make = lambda scans: make_cloud(  # noqa: E731
+        SlamMap(trajectory, slam_map.lines, slam_map.statistics, scans, slam_map.horizontal_mount), CloudParams()
+    )
+    return Place(make(noisy), mesh.vertices, mesh.triangles, make(clean).points)
+
+
+def simulated_place(name, seed=0, sigma=0.01):
+    """A scene of `simulate` at true poses."""
+    noisy, clean = simulated(name, seed=seed, range_sigma=sigma), simulated(name, seed=seed, range_sigma=0.0)
+    clouds = [make_cloud(true_slam_map(s), CloudParams()) for s in (noisy, clean)]
+    truth = noisy.truth
+    start = truth.poses[np.searchsorted(truth.time_ns, noisy.log.horizontal.time_ns[0])]
+    back = se2.between(start, np.zeros(3))
+    keep = np.isin(_key(clouds[1]), _key(clouds[0]))
+    assert keep.sum() == len(clouds[0].points), "noise moved beams out of the limits"
+    return Place(clouds[0], transform_points(back, noisy.vertices), noisy.triangles, clouds[1].points[keep])
+
+
+def _key(cloud):
+    return cloud.scan_index.astype(np.int64) * 10000 + cloud.beam_index
+
+
+def read_pcd(path):
+    """Points (n, 3) of a compressed PCD of float32 x y z."""
+    with gzip.open(path) as file:
+        data = file.read()
+    head, body = data.split(b"DATA binary_compressed\n")
+    count = int(next(line for line in head.split(b"\n") if line.startswith(b"POINTS")).split()[1])
+    packed, size = np.frombuffer(body[:8], "<u4")
+    return np.frombuffer(_lzf(body[8 : 8 + packed], int(size)), "<f4").reshape(3, count).T.astype(float)
+
+
+def _lzf(data, size):
+    """Decompress LZF."""
+    out = bytearray()
+    i = 0
+    while i < len(data):
+        control = data[i]
+        i += 1
+        if control < 32:
+            out += data[i : i + control + 1]
+            i += control + 1
+            continue
+        length = control >> 5
+        if length == 7:
+            length += data[i]
+            i += 1
+        start = len(out) - ((control & 31) << 8) - data[i] - 1
+        i += 1
+        for k in range(length + 2):
+            out.append(out[start + k])
+    assert len(out) == size
+    return bytes(out)
+
+
+def real_room():
+    """The real room as a cloud: half planes through the vertical axis, one a scan, each point once."""
+    points = read_pcd(REAL_ROOM)
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    steps = np.abs(np.diff(azimuth)) > np.radians(0.005)
+    run = np.concatenate([[0], np.cumsum(steps)])
+    elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
+    step = np.radians(0.97203)
+    beam = np.rint((np.pi / 2 - elevation) / step).astype(int)
+    centre = np.array([np.angle(np.mean(np.exp(1j * azimuth[run == k]))) for k in range(run[-1] + 1)])
+    order = np.argsort(np.unwrap(centre), kind="stable")
+    rank = np.argsort(order)
+    _, first = np.unique(rank[run] * 1000 + beam, return_index=True)
+    m, scan_of = len(order), rank[run][first]
+    poses = np.column_stack([np.zeros((m, 2)), centre[order]])
+    mount = np.eye(4)
+    mount[:3, :3] = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
+    stamps = np.arange(m) * 25_000_000
+    return PointCloud(
+        points=points[first],
+        scan_index=scan_of.astype(np.int32),
+        beam_index=beam[first].astype(np.int32),
+        time_ns=stamps[scan_of],
+        covariances=np.tile([1e-4, 0, 0, 1e-4, 0, 1e-4], (len(first), 1)),
+        scan_time_ns=stamps,
+        scan_poses=poses,
+        scan_pose_covariances=np.zeros((m, 3, 3)),
+        mount=mount,
+        angle_min=0.0,
+        angle_increment=step,
+        range_sigma=0.01,
+        angle_sigma=0.0005,
+    )

@@ -3,17 +3,22 @@
 import numpy as np
 
 from bsmap_cli.core import se2
-from bsmap_cli.model import Array, IntArray, LineMap, ScanLog, SlamMap, StepStatistics, Trajectory
+from bsmap_cli.model import Array, IntArray, LineMap, LoopClosures, ScanLog, SlamMap, StepStatistics, Trajectory
 from bsmap_cli.params import SlamParams
 from bsmap_cli.slam.lines import MappedLines, map_lines
-from bsmap_cli.slam.loops import close_loops
+from bsmap_cli.slam.loops import Closures, close_loops
 from bsmap_cli.slam.marginals import Marginals, marginals
-from bsmap_cli.slam.motion import beam_motion
+from bsmap_cli.slam.motion import beam_motion, odometry_motion
+from bsmap_cli.slam.posegraph import Edges, concatenate
 from bsmap_cli.slam.segments import Segments, extract_segments, scan_points
 from bsmap_cli.slam.smoothing import Smoothed, smooth
-from bsmap_cli.slam.tracking import Tracking, track_scans
+from bsmap_cli.slam.tracking import MATCH_FLOOR, Tracking, limited, track_scans
 from bsmap_cli.slam.upkeep import with_positive_offset
 from bsmap_cli.track import Track
+
+NO_ODOMETRY = np.array([0.1, 0.1, 0.05])
+ODOMETRY_FLOOR = np.array([0.003, 0.003, 0.002])
+"""Metres and radians by which a step between key scans may be off: as it was tracked, and by odometry at the least."""
 
 
 def run_graph(log: ScanLog, range_sigma: float, params: SlamParams, track: Track) -> SlamMap:
@@ -22,12 +27,23 @@ def run_graph(log: ScanLog, range_sigma: float, params: SlamParams, track: Track
     closures = close_loops(tracking, range_sigma, track)
     segments = _key_segments(log, tracking.keys, range_sigma, params)
     mapped = map_lines(closures.poses, segments, params)
-    smoothed = smooth(closures.poses, closures.edges, segments, mapped.lines, params.gate, params.overlap_margin)
+    odometry = _odometry_edges(log, tracking, closures.chain, params)
+    matches = _unexplained(log, tracking, closures, segments)
+    smoothed = smooth(closures.poses, odometry, matches, segments, mapped.lines, params.gate, params.overlap_margin)
     known = marginals(smoothed.information, len(smoothed.poses), len(smoothed.lines))
     trajectory = Trajectory(log.horizontal.time_ns, *_every_scan(tracking, smoothed.poses, known.poses))
     scans = log.horizontal
     statistics = _statistics(mapped, tracking.keys, len(scans.time_ns))
-    return SlamMap(trajectory, _line_map(smoothed, known), statistics, log.vertical, scans.mount, scans.frame_id)
+    return SlamMap(
+        trajectory,
+        _line_map(smoothed, known),
+        statistics,
+        log.vertical,
+        scans.mount,
+        scans.frame_id,
+        _of_scans(closures, tracking.keys),
+        tracking.poses,
+    )
 
 
 def _key_segments(log: ScanLog, keys: IntArray, range_sigma: float, params: SlamParams) -> Segments:
@@ -36,6 +52,36 @@ def _key_segments(log: ScanLog, keys: IntArray, range_sigma: float, params: Slam
     mount = se2.from_matrix(scans.mount)
     points = scan_points(scans.ranges[keys], scans.angles, mount, beam_motion(log)[keys])
     return extract_segments(points, mount[:2], range_sigma, params)
+
+
+def _odometry_edges(log: ScanLog, tracking: Tracking, chain: Edges, params: SlamParams) -> Edges:
+    """The chain by odometry alone; without odometry, that the robot went about as it was tracked."""
+    if log.odometry is None:
+        information = np.broadcast_to(np.diag(1.0 / NO_ODOMETRY**2), (len(chain.first), 3, 3))
+        return chain._replace(information=information.copy())
+    before, after = (log.odometry[tracking.keys[end]] for end in (chain.first, chain.second))
+    motions = [odometry_motion(a, b, params) for a, b in zip(before, after, strict=True)]
+    relative = np.array([motion.increment for motion in motions]).reshape(-1, 3)
+    noise = np.array([motion.noise for motion in motions]).reshape(-1, 3, 3) + np.diag(ODOMETRY_FLOOR) ** 2
+    # Single readings may be far off: then the edge gives way.
+    return Edges(chain.first, chain.second, relative, np.linalg.inv(noise), np.ones(len(relative), bool))
+
+
+def _unexplained(log: ScanLog, tracking: Tracking, closures: Closures, segments: Segments) -> Edges:
+    """Matches of the chain with what they know beyond the lines, and the closures.
+
+    The points of a scan that lie on lines speak through those; to count them in the match as well would make the same
+    noise count twice. What is left is taken in proportion to the points.
+    """
+    points = np.isfinite(log.horizontal.ranges[tracking.keys]).sum(axis=1)
+    on_lines = np.bincount(segments.scan, weights=segments.points, minlength=len(tracking.keys))
+    share = np.clip(1.0 - on_lines / np.maximum(points, 1), 0.0, 1.0)
+    chain = closures.chain
+    information = tracking.match_information[chain.second - 1] * share[chain.second, None, None]
+    failed = tracking.weak[chain.second]
+    information[failed] = 0.0
+    matches = chain._replace(information=limited(information, MATCH_FLOOR))
+    return concatenate([matches, closures.closures])
 
 
 def _every_scan(tracking: Tracking, poses: Array, covariances: Array) -> tuple[Array, Array]:
@@ -54,7 +100,32 @@ def _every_scan(tracking: Tracking, poses: Array, covariances: Array) -> tuple[A
     miss[:, 2] = se2.wrap(miss[:, 2])
     every = forward + share * miss
     every[:, 2] = se2.wrap(every[:, 2])
-    return every, covariances[before] + share[..., None] * (covariances[after] - covariances[before])
+    spread = covariances[before] + share[..., None] * (covariances[after] - covariances[before])
+    between = (share[:, 0] > 0) & (share[:, 0] < 1)
+    spread[between] += _match_covariances(tracking, every[between, 2], before[between])
+    return every, spread
+
+
+def _match_covariances(tracking: Tracking, heading: Array, key: IntArray) -> Array:
+    """(k, 3, 3) in map, of the tracked place of scans at `heading` (k,) after key scans `key` (k,) beside these.
+
+    That of a step from key scan to key scan, less its allowance for what neighbouring matches have in common.
+    """
+    step = np.linalg.inv(tracking.edges.information[key]) / 12
+    R = np.zeros((len(key), 3, 3))
+    R[:, 0, 0] = R[:, 1, 1] = np.cos(heading)
+    R[:, 1, 0] = np.sin(heading)
+    R[:, 0, 1] = -R[:, 1, 0]
+    R[:, 2, 2] = 1.0
+    spread = R @ step @ np.swapaxes(R, 1, 2)
+    return (spread + np.swapaxes(spread, 1, 2)) / 2
+
+
+def _of_scans(closures: Closures, keys: IntArray) -> LoopClosures:
+    """Closures between key scans as those between scans, the refused ones last."""
+    found = concatenate([closures.closures, closures.refused])
+    held = np.arange(len(found.first)) < len(closures.closures.first)
+    return LoopClosures(keys[found.first], keys[found.second], found.relative, held)
 
 
 def _line_map(smoothed: Smoothed, known: Marginals) -> LineMap:

@@ -40,11 +40,15 @@ WRONG = 25.0
 
 
 class Closures(NamedTuple):
-    """The poses that the closures lead to, the closures that hold, and the number of those refused afterwards."""
+    """poses : (n, 3) of the key scans, smoothed.  chain : tracking's edges, less those of relocated key scans.
+
+    closures : edges between places that were matched again, and hold.  refused : those that the others contradict.
+    """
 
     poses: Array
-    edges: Edges
-    refused: int
+    chain: Edges
+    closures: Edges
+    refused: Edges
 
 
 class _Search(NamedTuple):
@@ -61,10 +65,9 @@ def close_loops(tracking: Tracking, range_sigma: float, track: Track) -> Closure
     poses = tracking.poses[tracking.keys]
     way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
     noise = match_noise(range_sigma)
-    closures, failed = _no_edges(), dict[tuple[int, int], Array]()
-    chain = _relinked(tracking, noise)
-    if tracking.weak.any():
-        poses = posegraph.optimise(poses, chain).poses
+    chain, closures, failed = tracking.edges, _relinks(tracking, noise), dict[tuple[int, int], Array]()
+    if len(closures.first):
+        poses = posegraph.optimise(poses, posegraph.concatenate([chain, closures])).poses
     wide = False
     for k in range(ROUNDS):
         track("slam: loops", k, ROUNDS)
@@ -81,20 +84,15 @@ def close_loops(tracking: Tracking, range_sigma: float, track: Track) -> Closure
         closures = posegraph.concatenate([closures, found])
         poses = posegraph.optimise(poses, posegraph.concatenate([chain, closures])).poses
     holds = _holding(poses, closures)
-    edges = posegraph.concatenate([chain, take(closures, holds)])
-    poses = posegraph.optimise(poses, edges).poses
+    closures, refused = take(closures, holds), take(closures, ~holds)
+    poses = posegraph.optimise(poses, posegraph.concatenate([chain, closures])).poses
     relocated = _relocated(tracking, poses, noise)
     if len(relocated.first):
-        replaced = np.isin(edges.second, relocated.second) & tracking.weak[edges.second] & ~_is_closure(edges)
-        edges = posegraph.concatenate([take(edges, ~replaced), relocated])
-        poses = posegraph.optimise(poses, edges).poses
+        chain = take(chain, ~(np.isin(chain.second, relocated.second) & tracking.weak[chain.second]))
+        closures = posegraph.concatenate([closures, relocated])
+        poses = posegraph.optimise(poses, posegraph.concatenate([chain, closures])).poses
     track("slam: loops", ROUNDS, ROUNDS)
-    return Closures(poses, edges, int(np.count_nonzero(~holds)))
-
-
-def _is_closure(edges: Edges) -> NDArray[np.bool_]:
-    """(m,) edges that are not of the chain, whose second key scans ascend one by one."""
-    return np.arange(len(edges.second)) >= edges.second.max(initial=0)
+    return Closures(poses, chain, closures, refused)
 
 
 def _no_edges() -> Edges:
@@ -108,11 +106,11 @@ def _holding(poses: Array, closures: Edges) -> NDArray[np.bool_]:
     return distance < WRONG
 
 
-def _relinked(tracking: Tracking, noise: float) -> Edges:
-    """The chain of key scans, and a robust edge across each run of failed ones: the maps on both sides, matched."""
+def _relinks(tracking: Tracking, noise: float) -> Edges:
+    """An edge across each run of failed key scans: the small maps on both sides of it, matched."""
     poses = tracking.poses[tracking.keys]
     look = _Search(tracking.points, poses, np.zeros(len(poses)), noise)
-    parts = [tracking.edges]
+    parts = [_no_edges()]
     border = np.flatnonzero(np.diff(np.concatenate([[0], tracking.weak, [0]]).astype(int)))
     for start, after in border.reshape(-1, 2).tolist():
         before = start - 1

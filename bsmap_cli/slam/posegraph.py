@@ -73,20 +73,47 @@ def block_matrix(rows: IntArray, columns: IntArray, blocks: Array, size: int) ->
     return sparse.csc_matrix((blocks.ravel(), (row.ravel(), column.ravel())), shape=(size, size))
 
 
-def edge_blocks(
-    edges: Edges, weights: Array, error: Array, by_first: Array, by_second: Array
-) -> tuple[list[tuple[IntArray, IntArray, Array]], list[tuple[IntArray, Array]]]:
-    """Blocks (rows, columns, values) of the normal matrix and (rows, values) of its right-hand side."""
+class Term(NamedTuple):
+    """What some observations add to the normal equations.
+
+    blocks : (rows, columns, values (k, a, b)) of the matrix.  sides : (rows, values (k, a)) of the right-hand side.
+    distance : sum of the weighted squared Mahalanobis distances.  observations : their number, weighted.
+    """
+
+    blocks: list[tuple[IntArray, IntArray, Array]]
+    sides: list[tuple[IntArray, Array]]
+    distance: float
+    observations: float
+
+
+def edge_term(poses: Array, edges: Edges) -> Term:
+    """What the edges say at these poses (n, 3)."""
+    error, by_first, by_second = residuals(poses, edges)
+    distance, weights = weighted(edges, error)
+    weight = np.where(edges.robust, 1.0 / (1.0 + distance / ROBUST_WIDTH), 1.0)
     i, j = 3 * edges.first, 3 * edges.second
     first_w, second_w = np.swapaxes(by_first, 1, 2) @ weights, np.swapaxes(by_second, 1, 2) @ weights
     cross = first_w @ by_second
-    matrix = [
+    blocks = [
         (i, i, first_w @ by_first),
         (j, j, second_w @ by_second),
         (i, j, cross),
         (j, i, np.swapaxes(cross, 1, 2)),
     ]
-    return matrix, [(i, -np.einsum("mij,mj->mi", first_w, error)), (j, -np.einsum("mij,mj->mi", second_w, error))]
+    sides = [(i, -np.einsum("mij,mj->mi", first_w, error)), (j, -np.einsum("mij,mj->mi", second_w, error))]
+    return Term(blocks, sides, float(weight @ distance), 3 * float(weight.sum()))
+
+
+def term_matrix(term: Term, size: int) -> sparse.csc_matrix:
+    """Sparse (size, size) normal matrix of one term."""
+    parts = [block_matrix(rows, columns, values, size) for rows, columns, values in term.blocks]
+    return sum(parts[1:], parts[0])
+
+
+def add_side(side: Array, term: Term) -> None:
+    """Add a term's right-hand side to `side`, in place."""
+    for rows, values in term.sides:
+        np.add.at(side, rows[:, None] + np.arange(values.shape[1]), values)
 
 
 def factorise(matrix: sparse.csc_matrix) -> SuperLU:
@@ -102,14 +129,9 @@ def optimise(poses: Array, edges: Edges) -> Solution:
     n = len(poses)
     poses = poses.copy()
     for _ in range(ITERATIONS):
-        error, by_first, by_second = residuals(poses, edges)
-        _, weights = weighted(edges, error)
-        blocks, sides = edge_blocks(edges, weights, error, by_first, by_second)
-        rows, columns, values = (np.concatenate(part) for part in zip(*blocks, strict=True))
-        matrix = block_matrix(rows, columns, values, 3 * n)
-        side = np.zeros(3 * n)
-        for row, value in sides:
-            np.add.at(side, row[:, None] + np.arange(3), value)
+        term = edge_term(poses, edges)
+        matrix, side = term_matrix(term, 3 * n), np.zeros(3 * n)
+        add_side(side, term)
         step = factorise(matrix[3:, 3:]).solve(side[3:]).reshape(-1, 3)
         poses[1:] += step
         poses[:, 2] = se2.wrap(poses[:, 2])

@@ -1,7 +1,8 @@
 """Smoothing: key poses and lines together, by sparse Gauss-Newton over the pose graph and every line seen.
 
 The filter decides which lines there are; here every segment of every key scan is matched to them again from the
-smoothed poses, and poses and lines are solved for at once, so that nothing hangs on the order in which it was seen.
+smoothed poses, and poses and lines are solved for at once, so that nothing hangs on the order in which it was seen. How
+large the errors of motion, closures and lines really are is told by what is left of them: variance components.
 """
 
 from typing import NamedTuple
@@ -10,37 +11,27 @@ import numpy as np
 from scipy import sparse
 
 from bsmap_cli.core import se2
-from bsmap_cli.core.gaussian import chi2_gate
 from bsmap_cli.model import Array, IntArray, LineMap
 from bsmap_cli.slam import posegraph
-from bsmap_cli.slam.posegraph import ROBUST_WIDTH, Edges
+from bsmap_cli.slam.posegraph import Edges, Term
 from bsmap_cli.slam.segments import Segments
+from bsmap_cli.slam.sightings import Sightings, extents_and_hits, match_all, sighting_term
 
 ROUNDS = 3
 ITERATIONS = 5
 POSE_SPREAD = (0.05, 0.015)
 """Metres and radians by which a key pose may be off when segments are matched to lines for the first time."""
-AT_ONCE = 2000
-
-
-class Sightings(NamedTuple):
-    """Lines seen from key poses. pose, line : (m,).  observed : (m, 2) alpha, r in base_link.  information : (m, 2, 2).
-
-    segment : (m,), which of the segments it is.
-    """
-
-    pose: IntArray
-    line: IntArray
-    observed: Array
-    information: Array
-    segment: IntArray
+PROBES = 16
+LEAST_ODOMETRY_SCALE = 0.04
+LEAST_SCALE, MOST_SCALE = 0.02, 50.0
+"""Random vectors for the trace of a large inverse; limits of what the errors' variances may be off by in one step."""
 
 
 class Smoothed(NamedTuple):
     """poses : (n, 3).  lines : (m, 2) alpha, r with n pointing away from where the robot saw them.
 
     extents : (m, 2).  hits : (m,) key scans that saw the line.  information : sparse, of all poses and lines but the
-    first pose, which is held.
+    first pose, which is held.  scales : (3,) of the variances of odometry, matches and lines, as they came out.
     """
 
     poses: Array
@@ -48,105 +39,77 @@ class Smoothed(NamedTuple):
     extents: Array
     hits: IntArray
     information: sparse.csc_matrix
+    scales: Array
 
 
-def smooth(poses: Array, edges: Edges, segments: Segments, lines: LineMap, gate: float, margin: float) -> Smoothed:
-    """Poses (n, 3) and lines that agree best with the graph's edges and with the segments of the key scans.
+class _Problem(NamedTuple):
+    """Odometry from key scan to key scan, matches of scans (to the next ones and at closures), lines seen."""
 
-    segments : `scan` is the key pose.  gate, margin : as in the filter's association.
+    odometry: Edges
+    matches: Edges
+    sightings: Sightings
+
+    def scaled(self, scales: Array) -> "_Problem":
+        """With the variances of odometry, matches and sightings times `scales` (3,)."""
+        return _Problem(
+            _scaled(self.odometry, scales[0]),
+            _scaled(self.matches, scales[1]),
+            self.sightings._replace(information=self.sightings.information / scales[2]),
+        )
+
+    def terms(self, poses: Array, lines: Array) -> list[Term]:
+        """What each part says at these poses and lines."""
+        edges = [posegraph.edge_term(poses, part) for part in (self.odometry, self.matches)]
+        return [*edges, sighting_term(poses, lines, self.sightings)]
+
+
+def _scaled(edges: Edges, scale: float) -> Edges:
+    """Edges whose variances are `scale` times as large."""
+    return edges._replace(information=edges.information / scale)
+
+
+def smooth(
+    poses: Array, odometry: Edges, matches: Edges, segments: Segments, lines: LineMap, gate: float, margin: float
+) -> Smoothed:
+    """Poses (n, 3) and lines that agree best with odometry, matches and the segments of the key scans.
+
+    odometry, matches : edges.  segments : `scan` is the key pose.  gate, margin : as in the filter's association.
     """
     flip = lines.sides > 0  # back to n pointing away from the robot
     parameters = np.where(flip[:, None], lines.parameters * [1, -1] + [np.pi, 0], lines.parameters)
     extents = np.where(flip[:, None], -lines.extents[:, ::-1], lines.extents)
-    sightings = _match_all(poses, parameters, extents, segments, gate, margin, POSE_SPREAD)
-    information = sparse.csc_matrix((0, 0))
-    for k in range(ROUNDS):
+    spread, scales = POSE_SPREAD, np.ones(3)
+    for _ in range(ROUNDS):
+        sightings = match_all(poses, parameters, extents, segments, gate, margin, spread)
+        problem = _Problem(odometry, matches, sightings)
         for _ in range(ITERATIONS):
-            poses, parameters, information, largest = _iterate(poses, parameters, edges, sightings)
+            poses, parameters, information, largest = _iterate(poses, parameters, problem.scaled(scales))
+            scales = scales * _variance_components(problem.scaled(scales), poses, parameters, information)
+            # Neighbouring matches share most of their points: that they agree does not make them better.
+            scales[1] = max(scales[1], 1.0)
+            # What odometry is off by in a few steps says little of its drift, which is systematic.
+            scales[0] = max(scales[0], LEAST_ODOMETRY_SCALE)
             if largest < 1e-5:
                 break
-        extents, hits = _extents(poses, parameters, sightings, segments)
-        if k < ROUNDS - 1:
-            spread = (POSE_SPREAD[0] / 2, POSE_SPREAD[1] / 2)
-            sightings = _match_all(poses, parameters, extents, segments, gate, margin, spread)
-    return Smoothed(poses, parameters, extents, hits, information)
+        poses, parameters, information, _ = _iterate(poses, parameters, problem.scaled(scales))
+        extents, hits = extents_and_hits(poses, parameters, sightings, segments)
+        spread = (POSE_SPREAD[0] / 2, POSE_SPREAD[1] / 2)
+    return Smoothed(poses, parameters, extents, hits, information, scales)
 
 
-def _match_all(
-    poses: Array,
-    lines: Array,
-    extents: Array,
-    segments: Segments,
-    gate: float,
-    margin: float,
-    spread: tuple[float, float],
-) -> Sightings:
-    """The nearest line of each segment that passes the gate, given how far a pose can be off: metres, radians."""
-    found = []
-    for start in range(0, len(segments.scan), AT_ONCE):
-        rows = np.arange(start, min(start + AT_ONCE, len(segments.scan)))
-        found.append(_match_some(poses, lines, extents, segments, rows, margin, spread))
-    none = np.zeros(0, int)
-    segment, line = (np.concatenate([none, *(part[k] for part in found)]) for k in (0, 1))
-    near = np.concatenate([none, *(part[2] for part in found)]) < chi2_gate(gate, 2)
-    segment, line = segment[near], line[near]
-    information = np.linalg.inv(segments.covariances[segment])
-    return Sightings(segments.scan[segment], line, segments.parameters[segment], information, segment)
-
-
-def _match_some(
-    poses: Array,
-    lines: Array,
-    extents: Array,
-    segments: Segments,
-    rows: IntArray,
-    margin: float,
-    spread: tuple[float, float],
-) -> tuple[IntArray, IntArray, Array]:
-    """Segments of `rows` that lie beside a line, that line, and the squared distance."""
-    pose, seen = poses[segments.scan[rows]], segments.parameters[rows]
-    in_map = extents_of(pose, seen, segments.extents[rows])
-    turn = se2.wrap(seen[:, None, 0] + pose[:, None, 2] - lines[None, :, 0])
-    overlap = np.minimum(in_map[:, None, 1], extents[None, :, 1]) - np.maximum(in_map[:, None, 0], extents[None, :, 0])
-    a, b = np.nonzero((np.abs(turn) < 0.2) & (overlap > -margin))
-    alpha = lines[b, 0]
-    r = lines[b, 1] - pose[a, 0] * np.cos(alpha) - pose[a, 1] * np.sin(alpha)
-    # Compared in the middle of the segment, where direction and offset are nearly independent.
-    middle = segments.extents[rows[a]].mean(axis=1)
-    apart = seen[a, 1] - r - turn[a, b] * middle
-    C = segments.covariances[rows[a]]
-    offset_variance = C[:, 1, 1] - 2 * middle * C[:, 0, 1] + middle**2 * C[:, 0, 0] + spread[0] ** 2
-    distance = turn[a, b] ** 2 / (C[:, 0, 0] + spread[1] ** 2) + apart**2 / offset_variance
-    order = np.lexsort((distance, a))
-    nearest = order[np.diff(a[order], prepend=-1) > 0]
-    return rows[a[nearest]], b[nearest], distance[nearest]
-
-
-def extents_of(poses: Array, parameters: Array, extents: Array) -> Array:
-    """(k, 2) extents in map of segments (k,), each seen from its own pose (k, 3)."""
-    alpha = parameters[:, 0] + poses[:, 2]
-    shift = -poses[:, 0] * np.sin(alpha) + poses[:, 1] * np.cos(alpha)
-    return extents + shift[:, None]
-
-
-def _iterate(
-    poses: Array, lines: Array, edges: Edges, sightings: Sightings
-) -> tuple[Array, Array, sparse.csc_matrix, float]:
+def _iterate(poses: Array, lines: Array, problem: _Problem) -> tuple[Array, Array, sparse.csc_matrix, float]:
     """One step of Gauss-Newton; the normal matrix and the largest change come with it."""
     n, m = len(poses), len(lines)
-    blocks, sides = _graph_blocks(poses, edges)
-    more, more_sides = _sighting_blocks(poses, lines, sightings)
-    matrix = sum(
-        (posegraph.block_matrix(rows, columns, values, 3 * n + 2 * m) for rows, columns, values in blocks + more),
-        sparse.csc_matrix((3 * n + 2 * m, 3 * n + 2 * m)),
-    )
+    size = 3 * n + 2 * m
+    terms = problem.terms(poses, lines)
     # A line that no segment is matched to any more stays where it is.
-    unseen = np.setdiff1d(np.arange(m), sightings.line)
+    unseen = np.setdiff1d(np.arange(m), problem.sightings.line)
     held = 3 * n + (2 * unseen[:, None] + np.arange(2)).ravel()
-    matrix = matrix + sparse.csc_matrix((np.ones(len(held)), (held, held)), shape=matrix.shape)
-    side = np.zeros(3 * n + 2 * m)
-    for rows, values in sides + more_sides:
-        np.add.at(side, rows[:, None] + np.arange(values.shape[1]), values)
+    matrix = sparse.csc_matrix((np.ones(len(held)), (held, held)), shape=(size, size))
+    side = np.zeros(size)
+    for term in terms:
+        matrix = matrix + posegraph.term_matrix(term, size)
+        posegraph.add_side(side, term)
     free = sparse.csc_matrix(matrix[3:, 3:])
     step = np.concatenate([np.zeros(3), posegraph.factorise(free).solve(side[3:])])
     poses, lines = poses + step[: 3 * n].reshape(-1, 3), lines + step[3 * n :].reshape(-1, 2)
@@ -154,57 +117,20 @@ def _iterate(
     return poses, lines, free, float(np.abs(step).max(initial=0.0))
 
 
-Blocks = list[tuple[IntArray, IntArray, Array]]
-Sides = list[tuple[IntArray, Array]]
+def _variance_components(problem: _Problem, poses: Array, lines: Array, information: sparse.csc_matrix) -> Array:
+    """(3,) by how much the variances of the parts are too small (Foerstner 1979): residuals over redundancy.
 
-
-def _graph_blocks(poses: Array, edges: Edges) -> tuple[Blocks, Sides]:
-    error, by_first, by_second = posegraph.residuals(poses, edges)
-    _, weights = posegraph.weighted(edges, error)
-    return posegraph.edge_blocks(edges, weights, error, by_first, by_second)
-
-
-def _sighting_blocks(poses: Array, lines: Array, sightings: Sightings) -> tuple[Blocks, Sides]:
-    """Blocks of the lines seen, Eq. (9)-(10), with a robust weight: a false match must not bend the map."""
-    pose, (alpha, r) = poses[sightings.pose], lines[sightings.line].T
-    c, s = np.cos(alpha), np.sin(alpha)
-    error = np.stack(
-        [
-            se2.wrap(sightings.observed[:, 0] - alpha + pose[:, 2]),
-            sightings.observed[:, 1] - r + pose[:, 0] * c + pose[:, 1] * s,
-        ],
-        axis=1,
-    )
-    by_pose = np.zeros((len(r), 2, 3))  # of the error: minus the derivatives of h
-    by_pose[:, 0, 2], by_pose[:, 1, 0], by_pose[:, 1, 1] = 1.0, c, s
-    by_line = np.zeros((len(r), 2, 2))
-    by_line[:, 0, 0] = by_line[:, 1, 1] = -1.0
-    by_line[:, 1, 0] = pose[:, 1] * c - pose[:, 0] * s
-    distance = np.einsum("mi,mij,mj->m", error, sightings.information, error)
-    weights = sightings.information / (1.0 + distance / ROBUST_WIDTH)[:, None, None]
-    i, j = 3 * sightings.pose, 3 * len(poses) + 2 * sightings.line
-    pose_w, line_w = np.swapaxes(by_pose, 1, 2) @ weights, np.swapaxes(by_line, 1, 2) @ weights
-    cross = pose_w @ by_line
-    blocks = [
-        (i, i, pose_w @ by_pose),
-        (j, j, line_w @ by_line),
-        (i, j, cross),
-        (j, i, np.swapaxes(cross, 1, 2)),
-    ]
-    return blocks, [(i, -np.einsum("mij,mj->mi", pose_w, error)), (j, -np.einsum("mij,mj->mi", line_w, error))]
-
-
-def _extents(poses: Array, lines: Array, sightings: Sightings, segments: Segments) -> tuple[Array, IntArray]:
-    """Extents (m, 2) of what was seen of each line, and key scans (m,) that saw it."""
-    pose, alpha = poses[sightings.pose], sightings.observed[:, 0]
-    n, t = np.stack([np.cos(alpha), np.sin(alpha)], -1), np.stack([-np.sin(alpha), np.cos(alpha)], -1)
-    map_alpha = lines[sightings.line, 0]
-    along = np.stack([-np.sin(map_alpha), np.cos(map_alpha)], -1)
-    extents = np.tile([np.inf, -np.inf], (len(lines), 1))
-    for end in (0, 1):
-        point = n * sightings.observed[:, 1:] + t * segments.extents[sightings.segment, end : end + 1]
-        at = np.einsum("ij,ij->i", se2.transform(pose, point), along)
-        np.minimum.at(extents[:, 0], sightings.line, at)
-        np.maximum.at(extents[:, 1], sightings.line, at)
-    seen = np.unique(np.stack([sightings.line, sightings.pose], axis=1), axis=0)[:, 0]
-    return extents, np.bincount(seen, minlength=len(lines))
+    The redundancy of a part is its number of observations less the trace of N^-1 N_part, which random vectors of signs
+    estimate (Hutchinson 1990); the seed is fixed, so that the same data give the same scales.
+    """
+    size = 3 * len(poses) + 2 * len(lines)
+    probes = np.random.default_rng(0).choice([-1.0, 1.0], size=(size - 3, PROBES))
+    solved = posegraph.factorise(information).solve(probes)
+    scales = np.ones(3)
+    for k, term in enumerate(problem.terms(poses, lines)):
+        part = posegraph.term_matrix(term, size)[3:, 3:]
+        redundancy = term.observations - float(np.einsum("ik,ik->", solved, part @ probes)) / PROBES
+        # Without much left over, a part tells nothing of its own errors.
+        if redundancy > max(10.0, 0.05 * term.observations):
+            scales[k] = np.clip(term.distance / redundancy, LEAST_SCALE, MOST_SCALE)
+    return scales

@@ -31,6 +31,8 @@ WINDOW = 10
 GOOD, WEAK, FAR = 0.75, 0.5, 16.0
 """Shares of points on the map: below the first one a wider search is worth its time; below the second, or below the
 first so far from the prediction (squared Mahalanobis distance), the match is not believed and the prediction stands."""
+MATCH_FLOOR = np.array([0.003, 0.003, 0.0015])
+"""Metres and radians that a match is off at the least, for walls are rough."""
 MOST_POINTS = 400
 LEAST_SPREAD = np.array([0.02, 0.02, 0.01])
 """Metres and radians by which a prediction can be off however short the step."""
@@ -40,6 +42,7 @@ class Tracking(NamedTuple):
     """poses : (n, 3), of every scan, in the frame of the first.  keys : (k,) scans that became key scans.
 
     points : of each key scan, in base_link.  edges : from each key scan but the first to an earlier one.
+    match_information : (k - 1, 3, 3), what the match alone says of each edge.
     weak : (k,) key scans whose match failed, so that their edge holds no more than the motion prior.
     """
 
@@ -47,6 +50,7 @@ class Tracking(NamedTuple):
     keys: IntArray
     points: list[OrientedPoints]
     edges: Edges
+    match_information: Array
     weak: NDArray[np.bool_]
 
 
@@ -54,7 +58,7 @@ def track_scans(log: ScanLog, range_sigma: float, params: SlamParams, track: Tra
     """Poses of all scans by matching each to the local map."""
     n = len(log.horizontal.time_ns)
     poses = np.zeros((n, 3))
-    keys, key_points, information, inliers = [0], [], [], [1.0]
+    keys, key_points, information, by_match, inliers = [0], [], [], [], [1.0]
     last, before = 0, 0
     noise = match_noise(range_sigma)
     scans = _points_of_scans(log, range_sigma)
@@ -75,13 +79,15 @@ def track_scans(log: ScanLog, range_sigma: float, params: SlamParams, track: Tra
         if not _moved(step, params.key_distance, params.key_angle):
             continue
         inliers.append(found.inliers)
-        information.append(_edge_information(found, predicted, prior))
+        by_match.append(_in_frame_of(predicted, found.information))
+        information.append(_edge_information(by_match[-1], found, prior))
         keys.append(k)
         key_points.append(points)
         placed = [*placed[-WINDOW:], points.moved(poses[k])]
         target = make_target(joined([placed[j - len(keys)] for j in _local(inliers)]))
     chain = _chain(poses[keys], information, np.array(inliers))
-    return Tracking(poses, np.array(keys), key_points, chain, np.array(inliers) < WEAK)
+    match_information = np.array(by_match).reshape(-1, 3, 3)
+    return Tracking(poses, np.array(keys), key_points, chain, match_information, np.array(inliers) < WEAK)
 
 
 def _local(inliers: list[float]) -> list[int]:
@@ -147,14 +153,23 @@ def _worth(found: Match, predicted: Array, information: Array) -> float:
     return found.inliers - 0.02 * min(_departure(found, predicted, information), 15.0)
 
 
-def _edge_information(found: Match, predicted: Array, prior: Motion) -> Array:
-    """(3, 3) information of the step to a key scan, in the frame of its prediction; a failed match adds nothing."""
-    odometry = np.linalg.inv(prior.noise + np.diag(LEAST_SPREAD) ** 2)
-    if found.inliers < WEAK:
-        return odometry / 4
-    c, s = np.cos(predicted[2]), np.sin(predicted[2])
+def _in_frame_of(pose: Array, information: Array) -> Array:
+    """Information (3, 3) of a pose in map, in the axes of the robot at `pose`."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return np.linalg.inv(np.linalg.inv(R.T @ found.information @ R + odometry) + np.diag([0.003, 0.003, 0.0015]) ** 2)
+    return R.T @ information @ R
+
+
+def _edge_information(by_match: Array, found: Match, prior: Motion) -> Array:
+    """(3, 3) information of the step to a key scan, in the robot's axes; a failed match adds nothing to the prior."""
+    odometry = np.linalg.inv(prior.noise + np.diag(LEAST_SPREAD) ** 2)
+    return odometry / 4 if found.inliers < WEAK else limited(by_match + odometry, MATCH_FLOOR)
+
+
+def limited(information: Array, floor: Array) -> Array:
+    """Information (..., 3, 3) when errors with standard deviations `floor` (3,) come on top; it may be singular."""
+    both = np.asarray(np.linalg.solve(np.eye(3) + information * floor**2, information), dtype=np.float64)
+    return (both + np.swapaxes(both, -1, -2)) / 2
 
 
 def _chain(poses: Array, information: list[Array], inliers: Array) -> Edges:

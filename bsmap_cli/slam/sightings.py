@@ -1,0 +1,132 @@
+"""Lines seen from key poses: every segment matched to the line it is part of, and what the pairs say of both."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from bsmap_cli.core import se2
+from bsmap_cli.core.gaussian import chi2_gate
+from bsmap_cli.model import Array, IntArray
+from bsmap_cli.slam.posegraph import ROBUST_WIDTH, Term
+from bsmap_cli.slam.segments import Segments
+
+AT_ONCE = 2000
+"""Segments compared with all lines at a time."""
+
+
+class Sightings(NamedTuple):
+    """Lines seen from key poses. pose, line : (m,).  observed : (m, 2) alpha, r in base_link.  information : (m, 2, 2).
+
+    segment : (m,), which of the segments it is.
+    """
+
+    pose: IntArray
+    line: IntArray
+    observed: Array
+    information: Array
+    segment: IntArray
+
+
+def match_all(
+    poses: Array,
+    lines: Array,
+    extents: Array,
+    segments: Segments,
+    gate: float,
+    margin: float,
+    spread: tuple[float, float],
+) -> Sightings:
+    """The nearest line of each segment that passes the gate, given how far a pose can be off: metres, radians."""
+    found = []
+    for start in range(0, len(segments.scan), AT_ONCE):
+        rows = np.arange(start, min(start + AT_ONCE, len(segments.scan)))
+        found.append(_match_some(poses, lines, extents, segments, rows, margin, spread))
+    none = np.zeros(0, int)
+    segment, line = (np.concatenate([none, *(part[k] for part in found)]) for k in (0, 1))
+    near = np.concatenate([none, *(part[2] for part in found)]) < chi2_gate(gate, 2)
+    segment, line = segment[near], line[near]
+    information = np.linalg.inv(segments.covariances[segment])
+    return Sightings(segments.scan[segment], line, segments.parameters[segment], information, segment)
+
+
+def _match_some(
+    poses: Array,
+    lines: Array,
+    extents: Array,
+    segments: Segments,
+    rows: IntArray,
+    margin: float,
+    spread: tuple[float, float],
+) -> tuple[IntArray, IntArray, Array]:
+    """Segments of `rows` that lie beside a line, that line, and the squared distance."""
+    pose, seen = poses[segments.scan[rows]], segments.parameters[rows]
+    in_map = extents_of(pose, seen, segments.extents[rows])
+    turn = se2.wrap(seen[:, None, 0] + pose[:, None, 2] - lines[None, :, 0])
+    overlap = np.minimum(in_map[:, None, 1], extents[None, :, 1]) - np.maximum(in_map[:, None, 0], extents[None, :, 0])
+    a, b = np.nonzero((np.abs(turn) < 0.2) & (overlap > -margin))
+    alpha = lines[b, 0]
+    r = lines[b, 1] - pose[a, 0] * np.cos(alpha) - pose[a, 1] * np.sin(alpha)
+    # Compared in the middle of the segment, where direction and offset are nearly independent.
+    middle = segments.extents[rows[a]].mean(axis=1)
+    apart = seen[a, 1] - r - turn[a, b] * middle
+    C = segments.covariances[rows[a]]
+    offset_variance = C[:, 1, 1] - 2 * middle * C[:, 0, 1] + middle**2 * C[:, 0, 0] + spread[0] ** 2
+    distance = turn[a, b] ** 2 / (C[:, 0, 0] + spread[1] ** 2) + apart**2 / offset_variance
+    order = np.lexsort((distance, a))
+    nearest = order[np.diff(a[order], prepend=-1) > 0]
+    return rows[a[nearest]], b[nearest], distance[nearest]
+
+
+def extents_of(poses: Array, parameters: Array, extents: Array) -> Array:
+    """(k, 2) extents in map of segments (k,), each seen from its own pose (k, 3)."""
+    alpha = parameters[:, 0] + poses[:, 2]
+    shift = -poses[:, 0] * np.sin(alpha) + poses[:, 1] * np.cos(alpha)
+    return extents + shift[:, None]
+
+
+def sighting_term(poses: Array, lines: Array, sightings: Sightings) -> Term:
+    """Blocks of the lines seen, Eq. (9)-(10), with a robust weight: a false match must not bend the map."""
+    pose, (alpha, r) = poses[sightings.pose], lines[sightings.line].T
+    c, s = np.cos(alpha), np.sin(alpha)
+    error = np.stack(
+        [
+            se2.wrap(sightings.observed[:, 0] - alpha + pose[:, 2]),
+            sightings.observed[:, 1] - r + pose[:, 0] * c + pose[:, 1] * s,
+        ],
+        axis=1,
+    )
+    by_pose = np.zeros((len(r), 2, 3))  # of the error: minus the derivatives of h
+    by_pose[:, 0, 2], by_pose[:, 1, 0], by_pose[:, 1, 1] = 1.0, c, s
+    by_line = np.zeros((len(r), 2, 2))
+    by_line[:, 0, 0] = by_line[:, 1, 1] = -1.0
+    by_line[:, 1, 0] = pose[:, 1] * c - pose[:, 0] * s
+    distance = np.einsum("mi,mij,mj->m", error, sightings.information, error)
+    weight = 1.0 / (1.0 + distance / ROBUST_WIDTH)
+    weights = sightings.information * weight[:, None, None]
+    i, j = 3 * sightings.pose, 3 * len(poses) + 2 * sightings.line
+    pose_w, line_w = np.swapaxes(by_pose, 1, 2) @ weights, np.swapaxes(by_line, 1, 2) @ weights
+    cross = pose_w @ by_line
+    blocks = [
+        (i, i, pose_w @ by_pose),
+        (j, j, line_w @ by_line),
+        (i, j, cross),
+        (j, i, np.swapaxes(cross, 1, 2)),
+    ]
+    sides = [(i, -np.einsum("mij,mj->mi", pose_w, error)), (j, -np.einsum("mij,mj->mi", line_w, error))]
+    return Term(blocks, sides, float(weight @ distance), 2 * float(weight.sum()))
+
+
+def extents_and_hits(poses: Array, lines: Array, sightings: Sightings, segments: Segments) -> tuple[Array, IntArray]:
+    """Extents (m, 2) of what was seen of each line, and key scans (m,) that saw it."""
+    pose, alpha = poses[sightings.pose], sightings.observed[:, 0]
+    n, t = np.stack([np.cos(alpha), np.sin(alpha)], -1), np.stack([-np.sin(alpha), np.cos(alpha)], -1)
+    map_alpha = lines[sightings.line, 0]
+    along = np.stack([-np.sin(map_alpha), np.cos(map_alpha)], -1)
+    extents = np.tile([np.inf, -np.inf], (len(lines), 1))
+    for end in (0, 1):
+        point = n * sightings.observed[:, 1:] + t * segments.extents[sightings.segment, end : end + 1]
+        at = np.einsum("ij,ij->i", se2.transform(pose, point), along)
+        np.minimum.at(extents[:, 0], sightings.line, at)
+        np.maximum.at(extents[:, 1], sightings.line, at)
+    seen = np.unique(np.stack([sightings.line, sightings.pose], axis=1), axis=0)[:, 0]
+    return extents, np.bincount(seen, minlength=len(lines))

@@ -1,0 +1,71 @@
+"""Marginal covariances against the dense inverse."""
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from bsmap_cli.errors import BsmapError
+from bsmap_cli.slam.marginals import marginals
+
+
+def graph(poses: int, lines: int, seed: int = 0) -> np.ndarray:
+    """Dense information of all but the first pose: a chain, and lines seen from some poses."""
+    rng = np.random.default_rng(seed)
+    size = 3 * poses + 2 * lines
+    information = np.zeros((size, size))
+
+    def observe(columns: np.ndarray, rows: int) -> None:
+        J = np.zeros((rows, size))
+        J[:, columns] = rng.normal(size=(rows, len(columns)))
+        information[:] += J.T @ J
+
+    for k in range(poses - 1):
+        observe(np.arange(3 * k, 3 * k + 6), 3)
+    for line in range(lines):
+        for pose in rng.choice(poses, 3):
+            columns = np.r_[3 * pose + np.arange(3), 3 * poses + 2 * line + np.arange(2)]
+            observe(columns, 2)
+    return information[3:, 3:]
+
+
+def blocks(inverse: np.ndarray, first: int, count: int, size: int) -> np.ndarray:
+    at = first + size * np.arange(count)[:, None] + np.arange(size)
+    return inverse[at[:, :, None], at[:, None, :]]
+
+
+@pytest.mark.parametrize(("poses", "lines"), [(2, 0), (2, 1), (40, 7), (120, 90)])
+def test_every_block_is_that_of_the_dense_inverse(poses, lines):
+    information = graph(poses, lines)
+    found = marginals(sparse.csc_matrix(information), poses, lines)
+    inverse = np.linalg.inv(information)
+    np.testing.assert_array_equal(found.poses[0], 0.0)
+    np.testing.assert_allclose(found.poses[1:], blocks(inverse, 0, poses - 1, 3), rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(found.lines, blocks(inverse, 3 * (poses - 1), lines, 2), rtol=1e-6, atol=1e-9)
+
+
+def test_blocks_are_symmetric_to_the_last_bit():
+    found = marginals(sparse.csc_matrix(graph(60, 20)), 60, 20)
+    for P in (found.poses, found.lines):
+        np.testing.assert_array_equal(P, P.swapaxes(1, 2))
+
+
+def test_one_pose_alone_is_known_exactly():
+    found = marginals(sparse.csc_matrix((0, 0)), 1, 0)
+    np.testing.assert_array_equal(found.poses, np.zeros((1, 3, 3)))
+    assert found.lines.shape == (0, 2, 2)
+
+
+def test_long_chain_is_interpolated_between_poses_that_are_exact():
+    """A chain of equal steps: the covariance grows in proportion to the way, which interpolation gives back."""
+    n, step = 1000, np.diag([100.0, 100.0, 400.0])
+    J = sparse.diags_array([np.ones(n - 1), -np.ones(n - 2)], offsets=[0, -1], format="csc")
+    found = marginals(sparse.csc_matrix(sparse.kron(J.T @ J, step)), n, 0)
+    expected = np.arange(n)[:, None, None] * np.linalg.inv(step)
+    np.testing.assert_allclose(found.poses, expected, rtol=1e-6, atol=1e-12)
+
+
+def test_what_nothing_observes_has_no_covariance():
+    information = graph(5, 1)
+    information[-2:, :] = information[:, -2:] = 0.0
+    with pytest.raises(BsmapError):
+        marginals(sparse.csc_matrix(information), 5, 1)

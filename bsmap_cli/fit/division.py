@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.blocks import Blocks, make_blocks
 from bsmap_cli.fit.crossings import find_crossings
-from bsmap_cli.fit.heights import Base, CylinderBase, plane_base
-from bsmap_cli.fit.labels import adopt, drop_outliers, move_breaks, runs_of
+from bsmap_cli.fit.heights import Base, CylinderBase, HeightField, plane_base
+from bsmap_cli.fit.labels import adopt, drop_outliers, fill, move_breaks, runs_of
 from bsmap_cli.fit.lowmodels import fit_cylinder_frame, fit_plane_frame
 from bsmap_cli.fit.pieces import find_pieces
 from bsmap_cli.fit.regions import find_regions
@@ -21,6 +21,8 @@ FEWEST_BEAMS = 20
 """Of a face; what is smaller is left to the rest."""
 FARTHEST = 1.0
 """Metres by which a face's rectangle may grow towards its creases."""
+BELIEVED = 0.9
+"""Share of its beams that a face must fit."""
 ROUNDS = 2
 """Of dividing the beams anew by the fitted surfaces."""
 
@@ -47,15 +49,19 @@ def find_faces(grid: BeamGrid) -> Faces:
             labels[pieces.row[k], pieces.start[k] : pieces.stop[k]] = number
     labels = _renumber(labels, grid)
     fitted = _fit_all(grid, labels, sigma)
-    for _ in range(ROUNDS):
+    for step in range(ROUNDS):
         fields = [f.field for f in fitted]
         labels = drop_outliers(grid, labels, fields, sigma)
         labels = adopt(grid, labels, fields, sigma)
         labels = move_breaks(grid, labels, fields, sigma)
         labels, kept = _kept(labels, grid)
-        fitted = [
-            refit(fields[k], blocks, sigma) for k, blocks in zip(kept, blocks_of_faces(grid, labels), strict=True)
-        ]
+        if step < ROUNDS - 1:
+            fitted = _fit_all(grid, labels, sigma)
+        else:
+            blocks = blocks_of_faces(grid, labels)
+            fitted = [refit(fields[k], of_face, sigma) for k, of_face in zip(kept, blocks, strict=True)]
+    labels, kept = _believed(grid, labels, [f.field for f in fitted], sigma)
+    fitted = [fitted[k] for k in kept]
     return Faces(labels, _widened(grid, labels, fitted, sigma), sigma)
 
 
@@ -76,6 +82,16 @@ def _widened(grid: BeamGrid, labels: IntArray, fitted: list[Fitted], sigma: floa
             old = refit(field, blocks, sigma)
         out.append(old)
     return out
+
+
+def _believed(grid: BeamGrid, labels: IntArray, fields: list[HeightField], sigma: float) -> tuple[IntArray, IntArray]:
+    """Labels without outliers, nor the faces that many beams deny; and the numbers of the others."""
+    final = drop_outliers(grid, labels, fields, sigma)
+    for number in range(len(fields)):
+        before, after = (int(np.count_nonzero((a == number) & grid.hit)) for a in (labels, final))
+        if after < BELIEVED * before:
+            final[final == number] = -1
+    return _kept(fill(grid, final), grid)
 
 
 def _renumber(labels: IntArray, grid: BeamGrid) -> IntArray:

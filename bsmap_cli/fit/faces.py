@@ -50,7 +50,7 @@ def fit_faces(cloud: PointCloud, params: FitParams, *, track: Track = silent) ->
         grid = make_grid(cloud, movement.scans)
         beams = int(grid.hit.sum())
         data_sets.append(DataSet(name, movement.kind, int(movement.scans[0]), int(movement.scans[-1]), beams))
-        found = _fit_set(cloud, movement, name, grid, len(creases))
+        found = fit_set(cloud, movement.scans, name, grid, len(creases))
         if not found.surfaces:
             scans = len(grid.ranges)
             reason = f"no face in its {beams} points of {scans} scans"
@@ -66,13 +66,13 @@ def fit_faces(cloud: PointCloud, params: FitParams, *, track: Track = silent) ->
     return SurfaceMap(tuple(surfaces), tuple(data_sets), tuple(refused), {"fit": notes}, tuple(creases))
 
 
-def _fit_set(cloud: PointCloud, movement: Movement, name: str, grid: BeamGrid, first_crease: int) -> _Set:
+def fit_set(cloud: PointCloud, scans: IntArray, name: str, grid: BeamGrid, first_crease: int) -> _Set:
     """Faces of one data set; its creases are numbered from `first_crease`."""
     if len(grid.ranges) < 2:
         return _Set([], [], {})
     faces = find_faces(grid)
     trims = trim(grid, faces)
-    pose = (pose_part(cloud, movement, name),)
+    pose = (pose_part(cloud, Movement("", scans), name),)
     kept = [number for number, loops in enumerate(trims.loops) if loops]
     names = {number: f"{name}/{rank + 1:02d}" for rank, number in enumerate(kept)}
     used, creases = _creases(trims, names, first_crease)

@@ -12,6 +12,8 @@ from bsmap_cli.core.bspline import TensorSpline, clamped_knots, design_matrix, e
 from bsmap_cli.fit.lowmodels import axes_of
 from bsmap_cli.model import Array
 
+SETTLED = 1e-6
+"""Metres; a step of Newton's method below this is the last one."""
 STEEPEST = 0.05
 """Smallest sine between beam and surface that counts."""
 
@@ -118,6 +120,8 @@ class Feet(NamedTuple):
 def evaluate(field: HeightField, uv: Array) -> tuple[Array, Array]:
     """Heights (n,) and their gradients (n, 2) by s and t; beyond the rectangle the surface goes on straight."""
     k = field.knots
+    if k.shape == (2, 2):
+        return _bilinear(field, uv)
     inside = np.clip(uv, 0.0, 1.0)
     spline = TensorSpline(k.degree_s, k.degree_t, k.s, k.t, field.heights[:, :, None])
     value, by_u, by_v = evaluate_surface(spline, inside[:, 0], inside[:, 1], 1)[:, :, 0]
@@ -126,9 +130,19 @@ def evaluate(field: HeightField, uv: Array) -> tuple[Array, Array]:
     return height, gradient / (field.high - field.low)
 
 
+def _bilinear(field: HeightField, uv: Array) -> tuple[Array, Array]:
+    """The same for the least surface, whose formula holds beyond the rectangle, too."""
+    (a, b), (c, d) = field.heights
+    u, v = uv[:, 0], uv[:, 1]
+    twist = a - b - c + d
+    gradient = np.stack([c - a + twist * v, b - a + twist * u], axis=1)
+    return a + (c - a) * u + (b - a) * v + twist * u * v, gradient / (field.high - field.low)
+
+
 def find_feet(field: HeightField, points: Array, directions: Array, steps: int = 3) -> Feet:
     """Feet of beams through points (n, 3) along unit directions (n, 3), by Newton's method from the points."""
     beyond = np.zeros(len(points))
+    done = False
     for step in range(steps + 1):
         local = field.base.local(points + beyond[:, None] * directions)
         uv = field.parameters(local)
@@ -136,8 +150,11 @@ def find_feet(field: HeightField, points: Array, directions: Array, steps: int =
         turn = field.base.turn(local, directions)
         slope = turn[:, 2] - np.sum(gradient * turn[:, :2], axis=1)
         slope = np.where(np.abs(slope) < STEEPEST, np.where(slope < 0.0, -STEEPEST, STEEPEST), slope)
-        if step < steps:
-            beyond = beyond - np.clip((local[:, 2] - height) / slope, -5.0, 5.0)
+        if done or step == steps:
+            break
+        move = np.clip((local[:, 2] - height) / slope, -5.0, 5.0)
+        beyond = beyond - move
+        done = bool(np.abs(move).max(initial=0.0) < SETTLED)
     return Feet(uv, beyond, slope, points + beyond[:, None] * directions)
 
 

@@ -3,10 +3,11 @@
 import numpy as np
 
 from bsmap_cli.core import se2
+from bsmap_cli.core.table import take
 from bsmap_cli.model import Array, IntArray, LineMap, LoopClosures, ScanLog, SlamMap, StepStatistics, Trajectory
 from bsmap_cli.params import SlamParams
 from bsmap_cli.slam.lines import MappedLines, map_lines
-from bsmap_cli.slam.loops import Closures, close_loops
+from bsmap_cli.slam.loops import Closures, close_loops, is_loop
 from bsmap_cli.slam.marginals import Marginals, marginals
 from bsmap_cli.slam.motion import beam_motion, odometry_motion
 from bsmap_cli.slam.posegraph import Edges, concatenate
@@ -41,7 +42,7 @@ def run_graph(log: ScanLog, range_sigma: float, params: SlamParams, track: Track
         log.vertical,
         scans.mount,
         scans.frame_id,
-        _of_scans(closures, tracking.keys),
+        _loops(closures, tracking),
         tracking.poses,
     )
 
@@ -121,11 +122,12 @@ def _match_covariances(tracking: Tracking, heading: Array, key: IntArray) -> Arr
     return (spread + np.swapaxes(spread, 1, 2)) / 2
 
 
-def _of_scans(closures: Closures, keys: IntArray) -> LoopClosures:
-    """Closures between key scans as those between scans, the refused ones last."""
-    found = concatenate([closures.closures, closures.refused])
-    held = np.arange(len(found.first)) < len(closures.closures.first)
-    return LoopClosures(keys[found.first], keys[found.second], found.relative, held)
+def _loops(closures: Closures, tracking: Tracking) -> LoopClosures:
+    """Loops between key scans as those between scans, the refused ones last."""
+    parts = [take(edges, is_loop(closures.poses, edges)) for edges in (closures.closures, closures.refused)]
+    held = np.repeat([True, False], [len(part.first) for part in parts])
+    found = concatenate(parts)
+    return LoopClosures(tracking.keys[found.first], tracking.keys[found.second], found.relative, held)
 
 
 def _line_map(smoothed: Smoothed, known: Marginals) -> LineMap:

@@ -42,7 +42,8 @@ WRONG = 25.0
 class Closures(NamedTuple):
     """poses : (n, 3) of the key scans, smoothed.  chain : tracking's edges, less those of relocated key scans.
 
-    closures : edges between places that were matched again, and hold.  refused : those that the others contradict.
+    closures : edges between places that were matched again, and hold.  refused : those that the others contradict, or
+    that nothing supported.
     """
 
     poses: Array
@@ -66,6 +67,7 @@ def close_loops(tracking: Tracking, range_sigma: float, track: Track) -> Closure
     way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
     noise = match_noise(range_sigma)
     chain, closures, failed = tracking.edges, _relinks(tracking, noise), dict[tuple[int, int], Array]()
+    alone = [_no_edges()]
     if len(closures.first):
         poses = posegraph.optimise(poses, posegraph.concatenate([chain, closures])).poses
     wide = False
@@ -73,7 +75,9 @@ def close_loops(tracking: Tracking, range_sigma: float, track: Track) -> Closure
         track("slam: loops", k, ROUNDS)
         look = _Search(tracking.points, poses, way, noise)
         found = _find(look, closures, failed, _far_from(closures, way) if wide else None)
-        found = take(found, _supported(look, found))
+        supported = _supported(look, found)
+        alone.append(take(found, ~supported))
+        found = take(found, supported)
         if len(found.first) == 0:
             if wide:
                 break
@@ -92,7 +96,25 @@ def close_loops(tracking: Tracking, range_sigma: float, track: Track) -> Closure
         closures = posegraph.concatenate([closures, relocated])
         poses = posegraph.optimise(poses, posegraph.concatenate([chain, closures])).poses
     track("slam: loops", ROUNDS, ROUNDS)
-    return Closures(poses, chain, closures, refused)
+    return Closures(poses, chain, closures, posegraph.concatenate([refused, _never_made(alone, closures, refused)]))
+
+
+def _never_made(alone: list[Edges], *made: Edges) -> Edges:
+    """The last one of each pair of key scans that no edge of `made` joins."""
+    found = posegraph.concatenate(alone)
+    joins = {pair for edges in made for pair in zip(edges.first.tolist(), edges.second.tolist(), strict=True)}
+    pairs = zip(found.first.tolist(), found.second.tolist(), strict=True)
+    last = {pair: k for k, pair in enumerate(pairs) if pair not in joins}
+    return take(found, np.array(sorted(last.values()), int))
+
+
+def is_loop(poses: Array, edges: Edges) -> NDArray[np.bool_]:
+    """(m,) edges with so much way along the poses (n, 3) between their ends that they close a loop.
+
+    The others lead past scans that could not be matched.
+    """
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
+    return np.asarray(way[edges.second] - way[edges.first] > LEAST_WAY)
 
 
 def _no_edges() -> Edges:

@@ -105,7 +105,7 @@ class FitParams(Checked):
     """Movement data sets and B-spline surfaces, method.md sections 6-8."""
 
     method: str = parameter(
-        "paper", "One surface for each smooth face, or the paper's one for each data set.", choices=("faces", "paper")
+        "faces", "One surface for each smooth face, or the paper's one for each data set.", choices=("faces", "paper")
     )
     degree_u: int = parameter(3, "Degree along the scan lines.", "", 1, 7)
     degree_v: int = parameter(3, "Degree across the scan lines.", "", 1, 7)

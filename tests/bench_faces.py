@@ -2,9 +2,11 @@
 
     python tests/bench_faces.py [seeds]
 
-rms, max: metres * 1000 from the faces at the feet of their beams to the true scene.  ratio: rms over the statistical
-limit sigma * sqrt(control points / beams).  all: rms from the true points of all beams to the trimmed surfaces, capped at
-0.1 m.  stray: samples of the surfaces farther than 3 cm from the truth, per thousand.  Means over seeds; max the largest.
+rms, max: millimetres from the faces at the feet of their beams to the true scene.
+ratio: rms over the statistical limit sigma * sqrt(control points / beams).
+all: rms from the true points of all beams to the trimmed surfaces, capped at 0.1 m.
+stray: samples of the surfaces farther than 3 cm from the truth, per thousand.
+Means over seeds; max is the largest.
 """
 
 import sys

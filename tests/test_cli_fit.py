@@ -31,8 +31,16 @@ def test_it_is_made_once_and_again_when_something_changed(cloud):
 
 
 def test_options_reach_the_fit(cloud, tmp_path):
-    assert bsmap("fit", cloud, "--degree-u", "1", "--degree-v", "2", "-o", tmp_path / "flat.json").code == 0
+    options = ("--method", "paper", "--degree-u", "1", "--degree-v", "2")
+    assert bsmap("fit", cloud, *options, "-o", tmp_path / "flat.json").code == 0
     assert {(s.degree_u, s.degree_v) for s in read_surfaces(tmp_path / "flat.json").surfaces} == {(1, 2)}
+
+
+def test_faces_are_the_default_and_trimmed(cloud, tmp_path):
+    assert bsmap("fit", cloud, "-o", tmp_path / "faces.json").code == 0
+    surface_map = read_surfaces(tmp_path / "faces.json")
+    assert len(surface_map.surfaces) > len(surface_map.data_sets)
+    assert all(surface.trims for surface in surface_map.surfaces)
 
 
 def test_what_it_refuses(cloud, tmp_path):

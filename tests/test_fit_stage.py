@@ -1,4 +1,4 @@
-"""The stage as a whole: PointCloud -> SurfaceMap on the simulated room and on poor clouds."""
+"""The paper's method as a whole: PointCloud -> SurfaceMap on the simulated room and on poor clouds."""
 
 from dataclasses import replace
 from functools import cache
@@ -28,7 +28,7 @@ def room_cloud():
 
 @cache
 def room_surfaces():
-    return fit_surfaces(room_cloud(), FitParams())
+    return fit_surfaces(room_cloud(), FitParams(method="paper"))
 
 
 def pick(cloud, keep):
@@ -93,7 +93,7 @@ def test_surface_covariance_is_small_and_positive():
 
 
 def test_same_cloud_gives_the_same_surfaces():
-    again = fit_surfaces(pick(room_cloud(), room_cloud().scan_index < 20), FitParams())
+    again = fit_surfaces(pick(room_cloud(), room_cloud().scan_index < 20), FitParams(method="paper"))
     first, second = room_surfaces().surfaces[0], again.surfaces[0]
     np.testing.assert_array_equal(first.control_points, second.control_points)
     np.testing.assert_array_equal(first.covariance.blocks, second.covariance.blocks)
@@ -106,7 +106,7 @@ def test_missing_returns_do_not_stop_the_fit():
     keep = rng.random(len(cloud.points)) < 0.6
     keep &= ~np.isin(cloud.scan_index, [4, 5, 40, 80])
     keep &= ~(np.isin(cloud.scan_index, [8, 90]) & (cloud.beam_index > 5))
-    surface_map = fit_surfaces(pick(cloud, keep), FitParams())
+    surface_map = fit_surfaces(pick(cloud, keep), FitParams(method="paper"))
     assert len(surface_map.surfaces) == 7
     assert surface_map.notes["fit"]["set-01"]["scans"] == 17
     assert all(surface.residuals.mean < 0.05 for surface in surface_map.surfaces)
@@ -114,7 +114,7 @@ def test_missing_returns_do_not_stop_the_fit():
 
 def test_data_set_without_points_is_left_out_and_said_so():
     cloud = room_cloud()
-    surface_map = fit_surfaces(pick(cloud, cloud.scan_index >= 19), FitParams(knots_per_pass=20))
+    surface_map = fit_surfaces(pick(cloud, cloud.scan_index >= 19), FitParams(method="paper", knots_per_pass=20))
     assert [surface.name for surface in surface_map.surfaces] == [f"set-{k:02d}" for k in range(2, 8)]
     assert len(surface_map.data_sets) == 7
     (decision,) = surface_map.decisions
@@ -126,24 +126,26 @@ def test_cloud_without_movement_is_refused():
     cloud = room_cloud()
     still = replace(cloud, scan_poses=np.zeros_like(cloud.scan_poses))
     with pytest.raises(BsmapError, match="the robot stands still in all of the cloud's 131 scans"):
-        fit_surfaces(still, FitParams())
+        fit_surfaces(still, FitParams(method="paper"))
 
 
 def test_cloud_with_too_few_points_is_refused():
     cloud = room_cloud()
     with pytest.raises(BsmapError, match="are too few"):
-        fit_surfaces(pick(cloud, cloud.beam_index < 2), FitParams())
+        fit_surfaces(pick(cloud, cloud.beam_index < 2), FitParams(method="paper"))
 
 
 def test_bound_that_is_not_met_is_logged_and_noted(caplog):
-    fit_surfaces(pick(room_cloud(), room_cloud().scan_index < 6), FitParams(noise_margin=0.0, knots_per_pass=50))
+    fit_surfaces(
+        pick(room_cloud(), room_cloud().scan_index < 6), FitParams(method="paper", noise_margin=0.0, knots_per_pass=50)
+    )
     assert "over the bound of 0.010 m: no room for more knots" in caplog.text
 
 
 @pytest.mark.parametrize("degree", [1, 2, 5])
 def test_other_degrees_fit_too(degree):
     cloud = pick(room_cloud(), room_cloud().scan_index < 19)
-    surface_map = fit_surfaces(cloud, FitParams(degree_u=degree, degree_v=degree))
+    surface_map = fit_surfaces(cloud, FitParams(method="paper", degree_u=degree, degree_v=degree))
     (surface,) = surface_map.surfaces
     assert (surface.degree_u, surface.degree_v) == (degree, degree)
     assert surface.residuals.mean < 0.04

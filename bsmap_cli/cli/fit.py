@@ -16,7 +16,7 @@ from bsmap_cli.track import Track
 @parameters(FitParams)
 @force_option
 def fit(cloud_ply: Path, output: Path | None, fit_params: FitParams, force: bool) -> None:
-    """B-spline surfaces with covariance, one for each movement of the robot: X.surfaces.json."""
+    """B-spline surfaces with covariance, one for each smooth face of each movement of the robot: X.surfaces.json."""
     make_surfaces_file(cloud_ply, output or beside(cloud_ply, ".surfaces.json", [".cloud.ply"]), fit_params, force)
 
 

@@ -20,7 +20,7 @@ from bsmap_cli.fit.heights import (
 )
 from bsmap_cli.model import Array
 
-PRICE = 4.0
+PRICE = 5.0
 """Of a control point, in chi square: between Akaike's 2, which keeps the covariance honest, and the logarithm of the
 number of data (BIC), which leaves gentle arcs flat."""
 HIGHEST_DEGREE = 3

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from bsmap_cli.core.bspline import evaluate_grid
+from bsmap_cli.core.bspline import evaluate_grid, evaluate_surface
+from bsmap_cli.core.trims import inside_trims
 from bsmap_cli.model import PointCloud, SlamMap, SurfaceMap, segment_ends
 from bsmap_cli.picture.figure import new_figure, save
 
@@ -38,9 +39,15 @@ def _draw_surfaces(axes: Any, one: SurfaceMap) -> None:
 
     colors = colormaps["tab20"].colors  # type: ignore[attr-defined]
     u, v = np.linspace(0, 1, 60), np.linspace(0, 1, 15)
+    parameters = np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1)
     for k, surface in enumerate(one.surfaces):
-        x, y, z = np.moveaxis(evaluate_grid(surface, u, v), 2, 0)
-        axes.plot_wireframe(x, y, z, color=colors[k % len(colors)], linewidth=0.4, rcount=60, ccount=15)
+        color = colors[k % len(colors)]
+        points = evaluate_grid(surface, u, v)
+        points[~inside_trims(surface, parameters.reshape(-1, 2)).reshape(points.shape[:2])] = np.nan
+        axes.plot_wireframe(*np.moveaxis(points, 2, 0), color=color, linewidth=0.4, rcount=60, ccount=15)
+        for loop in surface.trims:
+            closed = np.concatenate([loop.parameters, loop.parameters[:1]])
+            axes.plot(*evaluate_surface(surface, *closed.T).T, color=color, linewidth=1.0)
     count = sum(s.control_points.shape[0] * s.control_points.shape[1] for s in one.surfaces)
     axes.set(title=f"{len(one.surfaces)} surfaces, {count} control points", aspect="equal")
     axes.view_init(elev=55, azim=-60)

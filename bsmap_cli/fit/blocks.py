@@ -9,6 +9,8 @@ from bsmap_cli.model import Array, IntArray
 
 LARGEST = 8
 """Beams of a block."""
+FEWEST = 3
+"""Blocks of a run, if it has so many beams: one alone would not tell how the surface lies along the scan."""
 LONGEST = 0.2
 """Metres from the first to the last beam of a block: over it a surface must be flat to much less than the noise."""
 
@@ -49,7 +51,7 @@ def make_blocks(grid: BeamGrid, row: IntArray, start: IntArray, stop: IntArray) 
     ends = np.zeros((len(row), 2, 3))
     ends[owner[::-1], 0], ends[owner, 1] = points[::-1], points
     metres = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
-    share = np.ceil(np.maximum(length / LARGEST, metres / LONGEST)).astype(np.int64).clip(1)
+    share = np.ceil(np.maximum(length / LARGEST, metres / LONGEST)).astype(np.int64).clip(FEWEST)
     number = position * np.minimum(share, length)[owner] // length[owner]
     first = np.flatnonzero((np.diff(owner, prepend=-1) != 0) | (np.diff(number, prepend=-1) != 0))
     counts = np.diff(np.append(first, len(flat))).astype(float)

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.blocks import Blocks, make_blocks
+from bsmap_cli.fit.clutter import find_planes
 from bsmap_cli.fit.crossings import find_crossings
 from bsmap_cli.fit.heights import Base, CylinderBase, HeightField, plane_base
 from bsmap_cli.fit.labels import adopt, drop_outliers, fill, move_breaks, runs_of
@@ -17,7 +18,7 @@ from bsmap_cli.fit.selection import Fitted, fit_heights, refit
 from bsmap_cli.fit.unions import low_order_cost
 from bsmap_cli.model import Array, IntArray
 
-FEWEST_BEAMS = 20
+FEWEST_BEAMS = 12
 """Of a face; what is smaller is left to the rest."""
 FARTHEST = 1.0
 """Metres by which a face's rectangle may grow towards its creases."""
@@ -49,11 +50,14 @@ def find_faces(grid: BeamGrid) -> Faces:
             labels[pieces.row[k], pieces.start[k] : pieces.stop[k]] = number
     labels = _renumber(labels, grid)
     fitted = _fit_all(grid, labels, sigma)
+    rng = np.random.default_rng(0)
     for step in range(ROUNDS):
         fields = [f.field for f in fitted]
         labels = drop_outliers(grid, labels, fields, sigma)
         labels = adopt(grid, labels, fields, sigma)
         labels = move_breaks(grid, labels, fields, sigma)
+        if step < ROUNDS - 1:
+            labels = find_planes(grid, labels, sigma, rng)
         labels, kept = _kept(labels, grid)
         if step < ROUNDS - 1:
             fitted = _fit_all(grid, labels, sigma)

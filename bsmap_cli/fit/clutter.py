@@ -77,12 +77,13 @@ def _sampled_planes(points: Array, rest: IntArray, rng: np.random.Generator) -> 
         near = np.flatnonzero((away[:, 0] <= REACH_SCANS) & (away[:, 1] <= REACH_BEAMS))
         if len(near) < 3:
             continue
-        a, b, c = points[first], *points[rng.choice(near, 2, replace=False)]
-        normal = np.cross(b - a, c - a)
+        start = points[first]
+        second, third = rng.choice(near, 2, replace=False)
+        normal = np.cross(points[second] - start, points[third] - start)
         length = np.linalg.norm(normal)
         if length > 1e-4:
             normals.append(normal / length)
-            offsets.append(float(normal @ a / length))
+            offsets.append(float(normal @ start / length))
     return np.array(normals).reshape(-1, 3), np.array(offsets)
 
 

@@ -1,0 +1,91 @@
+"""The part of surfaces' JSON that faces need: trims, creases, covariance of heights; every refusal by its message."""
+
+import json
+
+import numpy as np
+import pytest
+
+from bsmap_cli.errors import BadInputError
+from bsmap_cli.io.surfaces_json import read_surfaces, write_surfaces
+from bsmap_cli.model import (
+    BSplineSurface,
+    Crease,
+    HeightCovariance,
+    PosePart,
+    Residuals,
+    SurfaceMap,
+    TrimLoop,
+)
+
+CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+
+
+def face(name, crease):
+    net = np.zeros((2, 2, 3))
+    net[1, :, 0] = net[:, 1, 1] = 2.0
+    root = np.random.default_rng(0).normal(size=(4, 4)) * 1e-3
+    covariance = HeightCovariance(
+        np.array([[[0.0, 0.0, 1.0]]]), root @ root.T, (PosePart("d", np.zeros(2), np.eye(3) * 1e-6),)
+    )
+    knots = np.array([0.0, 0.0, 1.0, 1.0])
+    loop = TrimLoop(CORNERS, np.array([crease, -1, -1, -1]))
+    return BSplineSurface(name, ("d",), 1, 1, knots, knots, net, covariance, Residuals(9, 0.0, 0.0, 0.0, 0.0), (loop,))
+
+
+@pytest.fixture
+def path(tmp_path):
+    crease = Crease(("a", "b"), np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]))
+    write_surfaces(tmp_path / "a.json", SurfaceMap((face("a", 0), face("b", 0)), (), creases=(crease,)))
+    return tmp_path / "a.json"
+
+
+def test_faces_come_back(path):
+    read, made = read_surfaces(path), face("a", 0)
+    (first, _), (crease,) = read.surfaces, read.creases
+    np.testing.assert_array_equal(first.trims[0].parameters, CORNERS)
+    np.testing.assert_array_equal(first.trims[0].creases, [0, -1, -1, -1])
+    np.testing.assert_allclose(first.covariance.matrix, made.covariance.matrix, rtol=1e-6)
+    assert crease.surfaces == ("a", "b")
+
+
+def change(plain, value, *way):
+    for key in way[:-1]:
+        plain = plain[key]
+    plain[way[-1]] = value
+
+
+FIRST = ("surfaces", 0)
+
+
+@pytest.mark.parametrize(
+    ("value", "way", "message"),
+    [
+        (["a"], ("creases", 0, "surfaces"), r"creases\[0\]: surfaces has 1 names, wanted 2"),
+        (["a", "c"], ("creases", 0, "surfaces"), r"creases\[0\]: there is no surface 'c'"),
+        ([[0, 0]], ("creases", 0, "points"), r"points is 1 x 2, wanted any x 3"),
+        ([[0, 0], [1, 0]], (*FIRST, "trims", 0, "parameters"), "has 2 vertices, wanted 3 or more"),
+        ([[0, 0], [1, 0], [1, 1], [0, 1.5]], (*FIRST, "trims", 0, "parameters"), r"lie outside \[0, 1\]"),
+        ([0, 0, 1, 0], (*FIRST, "trims", 0, "creases"), r"creases\[2\] is 1, wanted -1 or a number of a crease"),
+        ([0, 0, 0], (*FIRST, "trims", 0, "creases"), "creases is 3, wanted 4"),
+        ([[[0, 0, 2]]], (*FIRST, "covariance", "directions"), "directions are not of length 1"),
+        (
+            [[[0, 0, 1]]] * 3,
+            (*FIRST, "covariance", "directions"),
+            "directions is 3 x 1 x 3, wanted 2 or 1 x 2 or 1 x 3",
+        ),
+        ([-1.0] + [0.0] * 9, (*FIRST, "covariance", "matrix"), "matrix is not positive semidefinite"),
+        ([1.0] * 9, (*FIRST, "covariance", "matrix"), "matrix is 9, wanted 10"),
+    ],
+)
+def test_what_is_wrong_is_named(path, value, way, message):
+    plain = json.loads(path.read_text())
+    change(plain, value, *way)
+    path.write_text(json.dumps(plain))
+    with pytest.raises(BadInputError, match=message):
+        read_surfaces(path)
+
+
+def test_covariance_of_the_wrong_size_is_refused():
+    good = face("a", -1)
+    with pytest.raises(ValueError, match=r"covariance of shape \(3, 3\) for 2 x 2 control points"):
+        BSplineSurface(**{**vars(good), "covariance": HeightCovariance(good.covariance.directions, np.eye(3), ())})

@@ -120,12 +120,16 @@ class FitParams(Checked):
 
 @dataclass(frozen=True)
 class MergeParams(Checked):
-    """Overlap, division and fusion, method.md section 9."""
+    """Faces joined by distance, gate, flatness and gap; whole surfaces by overlap, division and fusion (section 9)."""
 
     distance: float = parameter(0.1, "Surfaces farther apart than this do not overlap.", "m", 1e-3)
     gate: float = parameter(0.99, "Share of true pairs that the Mahalanobis gate lets pass.", "", 0.5, 0.999999)
     bound_u: float = parameter(0.01, "Largest error allowed along u when a merged patch is fitted.", "m", 1e-4)
     bound_v: float = parameter(0.05, "Largest error allowed along v when a merged patch is fitted.", "m", 1e-4)
+    flatness: float = parameter(0.002, "Standard deviation by which walls leave their faces.", "m", 1e-5, 0.1)
+    gap: float = parameter(
+        0.1, "Faces of two data sets that lie no farther apart touch; the gap is closed.", "m", 0.0, 1.0
+    )
 
 
 @dataclass(frozen=True)

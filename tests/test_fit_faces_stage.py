@@ -13,9 +13,8 @@ from bsmap_cli.evaluate import distance_to_mesh, surface_samples
 from bsmap_cli.export.tessellation import tessellate
 from bsmap_cli.fit import fit_surfaces
 from bsmap_cli.io.surfaces_json import read_surfaces, write_surfaces
-from bsmap_cli.merge import merge_surfaces
 from bsmap_cli.model import HeightCovariance
-from bsmap_cli.params import FitParams, MergeParams
+from bsmap_cli.params import FitParams
 
 FACES = FitParams(method="faces")
 
@@ -130,18 +129,6 @@ def test_file_gives_the_same_faces_back(tmp_path):
     assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
     assert surface_map.creases
     assert all(surface.trims for surface in surface_map.surfaces)
-
-
-def test_merging_passes_faces_on_and_says_so():
-    _, surface_map = corridor()
-    merged = merge_surfaces([surface_map, surface_map], MergeParams())
-    assert len(merged.surfaces) == 2 * len(surface_map.surfaces)
-    assert len(merged.creases) == 2 * len(surface_map.creases)
-    assert any("stay as they are" in decision.reason for decision in merged.decisions)
-    second = merged.surfaces[len(surface_map.surfaces)]
-    used = np.concatenate([loop.creases for loop in second.trims])
-    assert used.max() >= len(surface_map.creases)
-    assert second.name in merged.creases[used.max()].surfaces
 
 
 def test_same_cloud_gives_the_same_faces():

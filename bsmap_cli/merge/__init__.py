@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 
+from bsmap_cli.merge.faces import merge_faces, no_faces
 from bsmap_cli.merge.inputs import separate_faces, unite
 from bsmap_cli.merge.joining import merge_pair
 from bsmap_cli.merge.pairs import Overlap, find_overlap
@@ -48,10 +49,11 @@ def merge_surfaces(maps: Sequence[SurfaceMap], params: MergeParams, *, track: Tr
     Returns
     -------
     SurfaceMap of all merged and all other patches, with a decision for every pair that meets. Trimmed surfaces (faces)
-    stay as they are, which a decision says.
+    are joined whole, see `merge.faces`.
     """
     united = unite(maps)
-    surfaces, faces, about_faces = separate_faces(united.surfaces)
+    surfaces, trimmed = separate_faces(united.surfaces)
+    faces = merge_faces(trimmed, united.creases, params, track=track) if trimmed else no_faces()
     taken = {surface.name for surface in united.surfaces}
     search = _Search(params, dict(enumerate(make_patch(surface) for surface in surfaces)))
     search.neighbours = {number: set() for number in search.patches}
@@ -68,8 +70,9 @@ def merge_surfaces(maps: Sequence[SurfaceMap], params: MergeParams, *, track: Tr
     track("merging surfaces", search.tested, search.tested)
     notes = {"pairs_tested": search.tested, "mergings": mergings, "pairs_left_at_limit": len(search.waiting)}
     merged = tuple(patch.surface for patch in search.patches.values())
-    decisions = (*united.decisions, *about_faces, *search.decisions)
-    return SurfaceMap((*merged, *faces), united.data_sets, decisions, notes, united.creases)
+    decisions = (*united.decisions, *faces.decisions, *search.decisions)
+    surfaces_of_map = (*merged, *faces.surfaces)
+    return SurfaceMap(surfaces_of_map, united.data_sets, decisions, notes | faces.notes, tuple(faces.creases))
 
 
 def _test(search: _Search, pairs: Iterable[tuple[int, int]]) -> None:

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
-from bsmap_cli.model import BSplineSurface, Crease, Decision, HeightCovariance, SurfaceMap, TrimLoop
+from bsmap_cli.model import BSplineSurface, Crease, HeightCovariance, SurfaceMap, TrimLoop
 
 
 def unite(maps: Sequence[SurfaceMap]) -> SurfaceMap:
@@ -34,19 +34,14 @@ def _renumbered(surface: BSplineSurface, first: int) -> BSplineSurface:
     return replace(surface, trims=tuple(loops))
 
 
-def separate_faces(
-    surfaces: Iterable[BSplineSurface],
-) -> tuple[list[BSplineSurface], list[BSplineSurface], list[Decision]]:
-    """Surfaces that can be divided into patches, trimmed faces that cannot, and a decision that says so."""
+def separate_faces(surfaces: Iterable[BSplineSurface]) -> tuple[list[BSplineSurface], list[BSplineSurface]]:
+    """Surfaces that are divided into patches, and trimmed faces, which are joined whole."""
     whole: list[BSplineSurface] = []
     faces: list[BSplineSurface] = []
     for surface in surfaces:
         trimmed = bool(surface.trims) or isinstance(surface.covariance, HeightCovariance)
         (faces if trimmed else whole).append(surface)
-    if not faces:
-        return whole, faces, []
-    reason = "trimmed faces stay as they are: merging divides whole surfaces into patches"
-    return whole, faces, [Decision("", "", "refused", reason, {"faces": len(faces)})]
+    return whole, faces
 
 
 def _clash(names: Iterable[Sequence[str]]) -> bool:

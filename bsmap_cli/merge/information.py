@@ -1,0 +1,265 @@
+"""Faces over planes joined over one base in information form: heights, their knots and covariance, shares of poses.
+
+A data set A tells its control heights c_A with covariance Lambda_A^-1: the sensor part and what walls leave their
+spline by. With P_A from the heights c of the joined face to those of A, and G_A from the errors of pose e (unit
+variance each) to c_A, the sum of
+
+    (P_A c + G_A e - c_A)' Lambda_A (P_A c + G_A e - c_A)
+
+is least. It is a sum over data sets, so that their order does not matter.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.spatial.distance import cdist
+
+from bsmap_cli.core.bspline import clamped_knots
+from bsmap_cli.core.gaussian import symmetric_sqrt
+from bsmap_cli.fit.heights import (
+    HeightField,
+    Knots,
+    PlaneBase,
+    basis_matrix,
+    evaluate,
+    flat_knots,
+    greville,
+    plane_base,
+    with_degree,
+    with_knot,
+)
+from bsmap_cli.fit.selection import HIGHEST_DEGREE, MOST, PRICE, smoothness
+from bsmap_cli.merge.planar import PlanarFace
+from bsmap_cli.model import Array, HeightCovariance, PosePart
+
+WAVE = 1.0
+"""Metres over which a wall's departure from its spline is correlated."""
+PER_CONTROL_POINT = 4
+"""Samples for each control point and direction, through which heights are carried over to the common base."""
+ROBUST = 3.0
+"""Standard deviations beyond which a data set's heights count less (Huber)."""
+
+
+ALIGNED = 0.95
+"""Cosine between axes that count as the same."""
+LEAST_SPAN = 0.01
+"""Between knots, of the whole."""
+ENOUGH = 2.0
+"""Criterion for each height told, above which other knots are tried."""
+
+
+class Frame(NamedTuple):
+    """Common base of a group, and the rectangle from `low` (2,) to `high` (2,) that it fills, metres."""
+
+    base: PlaneBase
+    low: Array
+    high: Array
+
+
+class Told(NamedTuple):
+    """What one face of a data set tells about the joined face.
+
+    uv : (m, 2) parameters in the frame of samples of its rectangle.  carry : (k, m) from heights there to its own.
+    heights : (k,) its own, above the frame's plane.  root : (k, k) lower triangular, root' root = Lambda.
+    covariance : (k, k) of the heights, sensor part.  by_pose : (k, 3 p), of each of its pose parts in turn.
+    degrees, inner : along s and t of the frame, of its own spline: degrees, and knots in the frame's parameters, those
+    at its ends too where it is more than bilinear.
+    """
+
+    uv: Array
+    carry: Array
+    heights: Array
+    root: Array
+    covariance: Array
+    by_pose: Array
+    pose: tuple[PosePart, ...]
+    degrees: tuple[int, int]
+    inner: tuple[Array, Array]
+
+
+class Joined(NamedTuple):
+    """Height field of a joined face.  information : (n, n) of its heights.  gains : (n, k) of each face told.
+
+    criterion : chi square and price of the control points.
+    """
+
+    field: HeightField
+    information: Array
+    gains: list[Array]
+    criterion: float
+
+
+def common_frame(faces: Sequence[PlanarFace]) -> Frame:
+    """Plane through all faces, its normal towards the sensors, and the rectangle around the faces' own."""
+    points = np.concatenate([face.samples[face.areas > 0.0] for face in faces])
+    weights = np.concatenate([face.areas[face.areas > 0.0] for face in faces])
+    centred = points - np.average(points, axis=0, weights=weights)
+    normal = np.linalg.eigh(centred.T @ (weights[:, None] * centred))[1][:, 0]
+    votes = sum(face.area * face.facing * np.sign(face.normal @ normal) for face in faces)
+    first = normal[np.argmax(np.abs(normal))]
+    normal = normal * (np.sign(votes) if votes != 0.0 else np.sign(first))
+    base = plane_base(points, normal)
+    corners = np.concatenate([base.local(_places(face.field, np.array([0.0, 1.0])))[:, :2] for face in faces])
+    return Frame(base, corners.min(axis=0), corners.max(axis=0))
+
+
+def tell(face: PlanarFace, frame: Frame, flatness: float) -> Told:
+    """Carry a face's heights and their covariance over to the common base, by least squares on samples."""
+    field, covariance = face.field, face.surface.covariance
+    assert isinstance(covariance, HeightCovariance)
+    grid = _grid(field.knots)
+    places = field.base.place(np.column_stack([grid * (field.high - field.low), evaluate(field, grid)[0]]))
+    local = frame.base.local(places)
+    carry = np.asarray(np.linalg.pinv(basis_matrix(field.knots, grid)), dtype=np.float64)
+    n = frame.base.axes[:, 2]
+    by_pose = [carry @ _lifted(part, places, n) for part in covariance.pose]
+    k = field.knots
+    s, t = greville(k.s, k.degree_s), greville(k.t, k.degree_t)
+    at = np.stack(np.meshgrid(s, t, indexing="ij"), axis=-1).reshape(-1, 2) * (field.high - field.low)
+    uneven = flatness**2 * np.exp(-cdist(at, at) / WAVE)
+    L = np.linalg.cholesky(covariance.matrix + uneven)
+    root = solve_triangular(L, np.eye(len(L)), lower=True)
+    uv = (local[:, :2] - frame.low) / (frame.high - frame.low)
+    lifts = np.concatenate(by_pose, axis=1) if by_pose else np.zeros((len(at), 0))
+    degrees, inner = _knots_in(field, frame)
+    return Told(uv, carry, carry @ local[:, 2], root, covariance.matrix, lifts, covariance.pose, degrees, inner)
+
+
+def _knots_in(field: HeightField, frame: Frame) -> tuple[tuple[int, int], tuple[Array, Array]]:
+    """Degrees and knots of a face along the frame's axes; none where its own are skew to them."""
+    k = field.knots
+    if k.size == 4:
+        return (1, 1), (np.zeros(0), np.zeros(0))
+    turn = frame.base.axes[:, 0] @ field.base.axes[:, :2]  # type: ignore[union-attr]
+    degrees, inner = [1, 1], [np.zeros(0), np.zeros(0)]
+    for own, (degree, knots) in enumerate(((k.degree_s, k.s), (k.degree_t, k.t))):
+        axis = 0 if abs(turn[own]) > ALIGNED else 1
+        if axis == 1 and abs(turn[1 - own]) < ALIGNED:
+            continue
+        at = np.full((len(np.unique(knots)), 3), 0.0)
+        at[:, own] = np.unique(knots) * field.high[own]
+        local = frame.base.local(field.base.place(at))[:, :2]
+        along = ((local - frame.low) / (frame.high - frame.low))[:, axis]
+        degrees[axis], inner[axis] = degree, along if degree > 1 or len(along) > 2 else np.zeros(0)
+    return (degrees[0], degrees[1]), (inner[0], inner[1])
+
+
+def _lifted(part: PosePart, points: Array, normal: Array) -> Array:
+    """(m, 3) change of the heights of points (m, 3) by unit errors of a pose part, by its share."""
+    J = np.zeros((len(points), 3))
+    J[:, :2] = normal[:2]
+    J[:, 2] = normal[1] * (points[:, 0] - part.centre[0]) - normal[0] * (points[:, 1] - part.centre[1])
+    return np.asarray(part.weight * J @ symmetric_sqrt(part.covariance))
+
+
+def join(told: Sequence[Told], frame: Frame) -> Joined:
+    """Joined heights on the knots that the data pay for, found step by step from the least surface.
+
+    Where that does not end in a good fit, it is tried from the knots of all faces told, too.
+    """
+    best = _improved(told, frame, flat_knots())
+    own = _own_knots(told)
+    if own.size > 4 and best.criterion > ENOUGH * sum(len(one.heights) for one in told):
+        best = min(best, _improved(told, frame, own), key=lambda j: j.criterion)
+    return best
+
+
+def _improved(told: Sequence[Told], frame: Frame, knots: Knots) -> Joined:
+    best = solve(told, frame, knots)
+    for _ in range(40):
+        tried = [solve(told, frame, richer) for richer in _richer(best.field.knots)]
+        better = min(tried, key=lambda j: j.criterion, default=best)
+        if better.criterion >= best.criterion:
+            break
+        best = better
+    return best
+
+
+def _own_knots(told: Sequence[Told]) -> Knots:
+    """Highest degrees of the faces told, knots at all of theirs."""
+    degree_s, degree_t = (max(one.degrees[axis] for one in told) for axis in (0, 1))
+    s, t = (np.unique(np.round(np.concatenate([one.inner[axis] for one in told]), 6)) for axis in (0, 1))
+    return Knots(int(degree_s), int(degree_t), clamped_knots(degree_s, _spaced(s)), clamped_knots(degree_t, _spaced(t)))
+
+
+def _spaced(inner: Array) -> Array:
+    """Inner knots without those that come too soon after the one before."""
+    kept: list[float] = []
+    for knot in inner:
+        if LEAST_SPAN < knot < 1.0 - LEAST_SPAN and (not kept or knot - kept[-1] > LEAST_SPAN):
+            kept.append(float(knot))
+    return np.array(kept)
+
+
+def _richer(k: Knots) -> list[Knots]:
+    """One step richer: a degree more, or one span halved."""
+    if k.size >= MOST:
+        return []
+    out = []
+    if k.degree_s < HIGHEST_DEGREE:
+        out.append(k._replace(degree_s=k.degree_s + 1, s=with_degree(k.s, k.degree_s)))
+    if k.degree_t < HIGHEST_DEGREE:
+        out.append(k._replace(degree_t=k.degree_t + 1, t=with_degree(k.t, k.degree_t)))
+    out += [k._replace(s=with_knot(k.s, k.degree_s, new)) for new in _middles(k.s)]
+    out += [k._replace(t=with_knot(k.t, k.degree_t, new)) for new in _middles(k.t)]
+    return out
+
+
+def _middles(knots: Array) -> list[float]:
+    """Middles of the spans that are wide enough to be halved."""
+    edges = np.unique(knots)
+    return [float((a + b) / 2.0) for a, b in pairwise(edges) if b - a > 2.0 * LEAST_SPAN]
+
+
+def solve(told: Sequence[Told], frame: Frame, knots: Knots) -> Joined:
+    """Heights on given knots; data sets that disagree count less (two rounds)."""
+    wanted = [one.root @ one.heights for one in told]
+    N = [one.root @ (one.carry @ basis_matrix(knots, one.uv)) for one in told]
+    share = np.ones(len(told))
+    for _ in range(3):
+        H = smoothness(knots) + sum(w * n.T @ n for w, n in zip(share, N, strict=True))
+        factor = cho_factor(H)
+        c = cho_solve(factor, np.sum([w * n.T @ y for w, n, y in zip(share, N, wanted, strict=True)], axis=0))
+        squares = np.array([np.sum((y - n @ c) ** 2) for n, y in zip(N, wanted, strict=True)])
+        size = np.sqrt(squares / [len(y) for y in wanted])
+        share = np.minimum(1.0, ROBUST / np.maximum(size, 1e-12))
+    gains = [w * cho_solve(factor, n.T @ one.root) for w, n, one in zip(share, N, told, strict=True)]
+    field = HeightField(frame.base, frame.low, frame.high, knots, c.reshape(knots.shape))
+    counts = np.array([len(y) for y in wanted])
+    loss = np.where(size > ROBUST, counts * (2.0 * size - ROBUST) * ROBUST, squares)
+    return Joined(field, H, gains, float(loss.sum()) + PRICE * knots.size)
+
+
+def covariance_of(joined: Joined, told: Sequence[Told]) -> HeightCovariance:
+    """Sensor part sum K_A C_A K_A' of the heights, and the pose parts by their share in the whole.
+
+    The shares are the mean over the face: trace(K_A P_A) over the number of heights. They add up to 1.
+    """
+    matrix = np.sum([K @ one.covariance @ K.T for K, one in zip(joined.gains, told, strict=True)], axis=0)
+    shares = np.array(
+        [
+            np.trace(K @ one.carry @ basis_matrix(joined.field.knots, one.uv))
+            for K, one in zip(joined.gains, told, strict=True)
+        ]
+    )
+    parts: dict[str, PosePart] = {}
+    for share, one in zip(shares / shares.sum(), told, strict=True):
+        for part in one.pose:
+            before = parts[part.data_set].weight if part.data_set in parts else 0.0
+            parts[part.data_set] = replace(part, weight=float(before + share * part.weight))
+    directions = np.asarray(joined.field.base.axes[None, None, :, 2])  # type: ignore[union-attr]
+    return HeightCovariance(directions, (matrix + matrix.T) / 2.0, tuple(parts[name] for name in sorted(parts)))
+
+
+def _grid(knots: Knots) -> Array:
+    u, v = (np.linspace(0.0, 1.0, PER_CONTROL_POINT * n) for n in knots.shape)
+    return np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def _places(field: HeightField, ends: Array) -> Array:
+    uv = np.stack(np.meshgrid(ends, ends, indexing="ij"), axis=-1).reshape(-1, 2)
+    return field.base.place(np.column_stack([field.low + uv * (field.high - field.low), evaluate(field, uv)[0]]))

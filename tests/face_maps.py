@@ -1,0 +1,91 @@
+"""Small maps of trimmed faces over planes, as `bsmap fit` makes them, of known truth."""
+
+import numpy as np
+
+from bsmap_cli.model import (
+    BSplineSurface,
+    Crease,
+    DataSet,
+    HeightCovariance,
+    PosePart,
+    Residuals,
+    SurfaceMap,
+    TrimLoop,
+)
+
+FLAT = np.array([0.0, 0.0, 1.0, 1.0])
+SIGMA = 5e-4
+"""Metres, of the control heights."""
+
+
+def loop_of(corners, holes=()):
+    """Trim loops in parameters of a rectangle ((s0, t0), (s1, t1)) with holes, as shares of the surface."""
+    rings = [box(*corners)] + [box(*hole)[::-1] for hole in holes]
+    return tuple(TrimLoop(ring, np.full(len(ring), -1)) for ring in rings)
+
+
+def box(low, high):
+    return np.array([low, (high[0], low[1]), high, (low[0], high[1])], dtype=float)
+
+
+def wall(name, start, end, *, heights=(0.0, 2.5), offset=0.0, sensor=1.5, pose=None, noise=None, holes=()):
+    """Wall along x from `start` to `end` at y = offset, seen from y = sensor by the set its name begins with.
+
+    heights : z of lower and upper side.  noise : (2, 2) added to the control heights.  holes : in metres, (x, z) both.
+    """
+    x, z = np.meshgrid([start, end], heights, indexing="ij")
+    y = offset + (np.zeros((2, 2)) if noise is None else noise)
+    data_set = name.split("/")[0]
+    covariance = np.zeros((3, 3)) if pose is None else pose
+    part = PosePart(data_set, np.array([(start + end) / 2, sensor]), covariance)
+    size, low = np.array([end - start, heights[1] - heights[0]]), np.array([start, heights[0]])
+    shares = [[(np.array(corner) - low) / size for corner in hole] for hole in holes]
+    return BSplineSurface(
+        name,
+        (data_set,),
+        1,
+        1,
+        FLAT,
+        FLAT,
+        np.stack([x, y, z], axis=-1),
+        HeightCovariance(np.array([[[0.0, 1.0, 0.0]]]), SIGMA**2 * np.eye(4), (part,)),
+        Residuals(1000, 0.008, 0.01, 0.02, 0.03),
+        loop_of(((0.0, 0.0), (1.0, 1.0)), shares),
+    )
+
+
+def floor(name, start, end, *, far=3.0, sensor=1.5):
+    """Floor z = 0 over x from `start` to `end` and y from 0 to `far`."""
+    x, y = np.meshgrid([start, end], [0.0, far], indexing="ij")
+    data_set = name.split("/")[0]
+    part = PosePart(data_set, np.array([(start + end) / 2, sensor]), np.zeros((3, 3)))
+    return BSplineSurface(
+        name,
+        (data_set,),
+        1,
+        1,
+        FLAT,
+        FLAT,
+        np.stack([x, y, np.zeros((2, 2))], axis=-1),
+        HeightCovariance(np.array([[[0.0, 0.0, 1.0]]]), SIGMA**2 * np.eye(4), (part,)),
+        Residuals(1000, 0.008, 0.01, 0.02, 0.03),
+        loop_of(((0.0, 0.0), (1.0, 1.0))),
+    )
+
+
+def with_crease(first, second, number, start, end):
+    """Both surfaces with the side v = 0 of their first loop marked as crease `number`, and the crease along x."""
+    marked = []
+    for surface in (first, second):
+        loop = surface.trims[0]
+        trims = (TrimLoop(loop.parameters, np.array([number, -1, -1, -1])), *surface.trims[1:])
+        marked.append(BSplineSurface(**{**vars(surface), "trims": trims}))
+    return *marked, Crease((first.name, second.name), np.array([[start, 0.0, 0.0], [end, 0.0, 0.0]]))
+
+
+def map_of(*surfaces, creases=()):
+    """Map of these surfaces and their data sets."""
+    names = sorted({name for surface in surfaces for name in surface.data_sets})
+    return SurfaceMap(
+        surfaces, tuple(DataSet(name, "translation", 0, 20, 1000) for name in names), creases=tuple(creases)
+    )

@@ -1,0 +1,203 @@
+"""Faces of several data sets joined to one map: what is one becomes one, what is two stays two."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from face_maps import SIGMA, floor, map_of, wall, with_crease
+from face_scenes import simulated_place
+
+from bsmap_cli.core.bspline import evaluate_surface
+from bsmap_cli.core.trims import inside_trims
+from bsmap_cli.core.uncertainty import sensor_covariance, surface_covariance
+from bsmap_cli.evaluate import distance_to_mesh, surface_samples
+from bsmap_cli.fit import fit_surfaces
+from bsmap_cli.io.surfaces_json import read_surfaces, write_surfaces
+from bsmap_cli.merge import merge_surfaces
+from bsmap_cli.merge.planar import planar_face
+from bsmap_cli.merge.regions import region_of, united
+from bsmap_cli.model import SurfaceMap
+from bsmap_cli.params import FitParams, MergeParams
+
+
+def merged(*surfaces, **params):
+    return merge_surfaces([map_of(*surfaces)], MergeParams(**params))
+
+
+def area(surface):
+    return planar_face(surface).area
+
+
+def covers(surface, x, z):
+    """Whether a wall along x is there at (x, z)."""
+    grid = np.stack(np.meshgrid(np.linspace(0, 1, 201), np.linspace(0, 1, 201), indexing="ij"), -1).reshape(-1, 2)
+    at = evaluate_surface(surface, *grid.T)
+    nearest = np.argmin((at[:, 0] - x) ** 2 + (at[:, 2] - z) ** 2)
+    return bool(inside_trims(surface, grid[nearest : nearest + 1])[0])
+
+
+def test_overlapping_halves_of_a_wall_become_one_plane_with_less_variance():
+    rng = np.random.default_rng(1)
+    noises = [rng.normal(0.0, SIGMA, (2, 2)) for _ in range(2)]
+    parts = wall("a/1", 0.0, 4.0, noise=noises[0]), wall("b/1", 1.0, 6.0, noise=noises[1])
+    result = merged(*parts)
+    (one,) = result.surfaces
+    assert one.data_sets == ("a", "b")
+    assert area(one) == pytest.approx(15.0, abs=0.01)
+    assert np.abs(one.control_points[..., 1]).max() < 4 * SIGMA
+    at = np.array([[2.0, 1.2]])
+    before = min(
+        sensor_covariance(p, *((at - [p.control_points[0, 0, 0], 0.0]) / [w, 2.5]).T)[0, 1, 1]
+        for p, w in zip(parts, (4.0, 5.0), strict=True)
+    )
+    uv = np.array([[0.5, 0.5]])
+    assert sensor_covariance(one, *uv.T)[0, 1, 1] < before
+    assert [d.outcome for d in result.decisions] == ["merged"]
+
+
+def test_fused_heights_are_those_of_generalised_least_squares():
+    """Of the same rectangle twice: c = (A + B)^-1 (A a + B b), and its covariance by the gains."""
+    rng = np.random.default_rng(3)
+    noises = [rng.normal(0.0, SIGMA, (2, 2)) for _ in range(2)]
+    parts = [wall(f"{name}/1", 0.0, 4.0, noise=n) for name, n in zip("ab", noises, strict=True)]
+    (one,) = merged(*parts).surfaces
+    # Same covariance both: the mean, and half of it.
+    corners = one.control_points.reshape(-1, 3)
+    wanted = np.mean([p.control_points for p in parts], axis=0).reshape(-1, 3)
+    order = [int(np.argmin(np.linalg.norm(corners - w, axis=1))) for w in wanted]
+    np.testing.assert_allclose(corners[order], wanted, atol=2e-6)
+    np.testing.assert_allclose(np.diag(one.covariance.matrix), SIGMA**2 / 2, rtol=1e-3)
+
+
+def test_pose_parts_are_carried_with_shares_that_add_up_to_one():
+    pose = np.diag([1e-6, 1e-6, 1e-8])
+    (one,) = merged(wall("a/1", 0.0, 4.0, pose=pose), wall("b/1", 1.0, 6.0, pose=pose)).surfaces
+    assert sum(part.weight for part in one.covariance.pose) == pytest.approx(1.0)
+    assert {part.data_set for part in one.covariance.pose} == {"a", "b"}
+    uv = np.array([0.5]), np.array([0.5])
+    total, sensor = surface_covariance(one, *uv)[0], sensor_covariance(one, *uv)[0]
+    assert 0.4e-6 < total[1, 1] - sensor[1, 1] < 1.1e-6
+
+
+@pytest.mark.parametrize("thickness", [0.05, 0.1, 0.2])
+def test_two_sides_of_a_thin_wall_stay_two(thickness):
+    pose = np.diag([0.02**2, 0.02**2, 1e-6])
+    sides = [wall("a/1", 0.0, 4.0, pose=pose), wall("b/1", 0.0, 4.0, offset=-thickness, sensor=-1.5, pose=pose)]
+    result = merged(*sides)
+    assert len(result.surfaces) == 2
+    assert all("opposite" in d.reason or "farther apart" in d.reason for d in result.decisions)
+
+
+def test_step_of_four_centimetres_stays_apart_under_uncertain_poses():
+    """Both parts are seen by both data sets, with poses so uncertain that the gate alone would let them pass."""
+    pose = np.diag([0.02**2, 0.02**2, 1e-8])
+    parts = [
+        wall(f"{name}/{k}", start, start + 3.0, offset=offset, pose=pose)
+        for name in "ab"
+        for k, (start, offset) in enumerate([(0.0, 0.0), (2.95, 0.04)])
+    ]
+    result = merged(*parts)
+    assert len(result.surfaces) == 2
+    levels = sorted(np.mean(s.control_points[..., 1]) for s in result.surfaces)
+    np.testing.assert_allclose(levels, [0.0, 0.04], atol=1e-3)
+    assert any("apart" in d.reason for d in result.decisions if d.outcome == "refused")
+
+
+def test_pose_error_of_one_data_set_does_not_double_the_walls():
+    """Three walls at right angles, seen by two data sets, of which one is 2 cm off in both directions."""
+    pose = np.diag([0.02**2, 0.02**2, 1e-6])
+    first = [wall("a/1", 0.0, 4.0, pose=pose), wall("a/2", 0.0, 4.0, offset=3.0, pose=pose)]
+    second = [wall("b/1", 0.0, 4.0, offset=0.02, pose=pose), wall("b/2", 0.0, 4.0, offset=3.02, pose=pose)]
+    result = merged(*first, *second)
+    assert len(result.surfaces) == 2
+    levels = sorted(np.mean(s.control_points[..., 1]) for s in result.surfaces)
+    np.testing.assert_allclose(levels, [0.01, 3.01], atol=1e-3)
+
+
+def test_window_that_nobody_saw_stays_open_and_half_seen_ones_are_closed():
+    window, picture = ((1.0, 1.0), (2.0, 2.0)), ((3.0, 1.0), (3.5, 2.0))
+    (one,) = merged(wall("a/1", 0.0, 4.0, holes=[window, picture]), wall("b/1", 0.5, 4.5, holes=[window])).surfaces
+    assert not covers(one, 1.5, 1.5)
+    assert covers(one, 3.25, 1.5)
+    assert area(one) == pytest.approx(4.5 * 2.5 - 1.0, abs=0.01)
+
+
+def test_narrow_gap_between_data_sets_is_closed_and_a_wide_one_not():
+    (one,) = merged(wall("a/1", 0.0, 2.0), wall("b/1", 2.06, 4.0)).surfaces
+    assert area(one) == pytest.approx(10.0, abs=0.01)
+    assert len(merged(wall("a/1", 0.0, 2.0), wall("b/1", 2.3, 4.0)).surfaces) == 2
+
+
+def test_slit_inside_one_region_is_not_closed():
+    outer, slit = np.array([[0, 0], [4, 0], [4, 2], [0, 2.0]]), np.array([[1, 0.5], [1, 1.5], [1.05, 1.5], [1.05, 0.5]])
+    region = region_of([outer, slit])
+    other = region_of([np.array([[4, 0], [6, 0], [6, 2], [4, 2.0]])])
+    assert united([region, other], 0.1).area == pytest.approx(12.0 - 0.05, abs=1e-3)
+
+
+def test_creases_of_joined_faces_are_joined_and_both_faces_have_their_points():
+    a, low_a, crease_a = with_crease(wall("a/1", 0.0, 4.0), floor("a/2", 0.0, 4.0), 0, 0.0, 4.0)
+    b, low_b, crease_b = with_crease(wall("b/1", 3.0, 6.0), floor("b/2", 3.0, 6.0), 1, 3.0, 6.0)
+    result = merge_surfaces([map_of(a, low_a, b, low_b, creases=[crease_a, crease_b])], MergeParams())
+    assert len(result.surfaces) == 2
+    (crease,) = result.creases
+    assert set(crease.surfaces) == {surface.name for surface in result.surfaces}
+    assert np.ptp(crease.points[:, 0]) == pytest.approx(6.0, abs=1e-4)
+    for surface in result.surfaces:
+        loop = surface.trims[0]
+        ends = loop.parameters[(loop.creases == 0) | (np.roll(loop.creases, 1) == 0)]
+        at = evaluate_surface(surface, *ends.T)
+        gap = np.linalg.norm(crease.points[:, None] - at, axis=2).min(axis=1)
+        assert gap.max() < 1e-5
+
+
+def test_twice_the_same_map_gives_one_map_of_it_all():
+    parts = [wall("a/1", 0.0, 4.0), floor("a/2", 0.0, 4.0)]
+    result = merge_surfaces([map_of(*parts), map_of(*parts)], MergeParams())
+    assert len(result.surfaces) == 2
+    assert {name for s in result.surfaces for name in s.data_sets} == {"1.a", "2.a"}
+
+
+@cache
+def room():
+    place = simulated_place("room")
+    return place, fit_surfaces(place.cloud, FitParams(method="faces"))
+
+
+def test_room_is_there_once_and_as_true_as_before():
+    place, fitted = room()
+    result = merge_surfaces([fitted], MergeParams())
+    assert len(result.surfaces) < 0.4 * len(fitted.surfaces)
+    before, after = (
+        distance_to_mesh(surface_samples(m, 0.05), place.vertices, place.triangles) for m in (fitted, result)
+    )
+    assert after.mean() < min(4e-4, before.mean())
+    assert np.quantile(after, 0.95) < 1.5e-3
+
+
+def test_shuffled_input_gives_the_same_map():
+    _, fitted = room()
+    order = np.random.default_rng(0).permutation(len(fitted.surfaces))
+    shuffled = SurfaceMap(
+        tuple(fitted.surfaces[k] for k in order), fitted.data_sets[::-1], creases=fitted.creases, notes=fitted.notes
+    )
+    one, other = (merge_surfaces([m], MergeParams()) for m in (fitted, shuffled))
+    assert [s.name for s in one.surfaces] == [s.name for s in other.surfaces]
+    for a, b in zip(one.surfaces, other.surfaces, strict=True):
+        np.testing.assert_allclose(a.control_points, b.control_points, atol=1e-9)
+        np.testing.assert_allclose(a.covariance.matrix, b.covariance.matrix, atol=1e-15)
+        assert len(a.trims) == len(b.trims)
+        for p, q in zip(a.trims, b.trims, strict=True):
+            np.testing.assert_allclose(p.parameters, q.parameters, atol=1e-9)
+    for a, b in zip(one.creases, other.creases, strict=True):
+        np.testing.assert_allclose(a.points, b.points, atol=1e-9)
+
+
+def test_merged_faces_are_written_and_read(tmp_path):
+    _, fitted = room()
+    result = merge_surfaces([fitted], MergeParams())
+    write_surfaces(tmp_path / "a.map.json", result)
+    again = read_surfaces(tmp_path / "a.map.json")
+    write_surfaces(tmp_path / "b.map.json", again)
+    assert (tmp_path / "a.map.json").read_bytes() == (tmp_path / "b.map.json").read_bytes()
+    assert len(again.creases) == len(result.creases) > 0

@@ -12,7 +12,7 @@ from bsmap_cli.model import LineMap
 from bsmap_cli.slam.posegraph import ROBUST_WIDTH, Edges
 from bsmap_cli.slam.segments import Segments
 from bsmap_cli.slam.sightings import Sightings, match_all, sighting_term
-from bsmap_cli.slam.smoothing import smooth
+from bsmap_cli.slam.smoothing import Evidence, smooth
 
 WALLS = np.array([[0.0, 4.0], [np.pi / 2, 3.0], [np.pi, 4.0], [-np.pi / 2, 3.0], [0.0, 2.0]])
 """alpha, r of the sides of a room and of a board in it, as seen from within: n points away from the robot."""
@@ -67,7 +67,8 @@ class Case:
 
     def smoothed(self, **changed):
         given = {"segments": self.segments, "lines": self.lines} | changed
-        return smooth(self.start, self.odometry, self.none, given["segments"], given["lines"], GATE, MARGIN)
+        evidence = Evidence(self.odometry, self.none)
+        return smooth(self.start, evidence, evidence, given["segments"], given["lines"], GATE, MARGIN)
 
 
 def one_sighting(rng) -> Sightings:

@@ -161,6 +161,23 @@ def augment(state: FilterState, observed: Array, noise: Array) -> FilterState:
     return FilterState(state.mean, P, n + 2)
 
 
+def insert(state: FilterState, line: Array, covariance: Array) -> FilterState:
+    """Append a line (2,) alpha, r of the map with covariance (2, 2), independent of all the rest."""
+    state = _with_room(state, state.size + 2)
+    P, n = state.covariance, state.size
+    P[n : n + 2, :n] = 0.0
+    P[n : n + 2, n : n + 2] = covariance
+    state.mean[n : n + 2] = line
+    return FilterState(state.mean, P, n + 2)
+
+
+def line_covariances(state: FilterState) -> Array:
+    """(m, 2, 2) marginal covariances of the lines."""
+    index = 3 + 2 * np.arange(len(state.lines))[:, None] + np.arange(2)
+    rows, columns = np.maximum(index[:, :, None], index[:, None]), np.minimum(index[:, :, None], index[:, None])
+    return state.covariance[rows, columns]
+
+
 def remove(state: FilterState, line: int) -> FilterState:
     """Marginalise a line out; the last line takes its place."""
     P, n, at = state.covariance, state.size, 3 + 2 * line

@@ -12,7 +12,7 @@ from bsmap_cli.slam.marginals import Marginals, marginals
 from bsmap_cli.slam.motion import beam_motion, odometry_motion
 from bsmap_cli.slam.posegraph import Edges, concatenate
 from bsmap_cli.slam.segments import Segments, extract_segments, scan_points
-from bsmap_cli.slam.smoothing import Smoothed, smooth
+from bsmap_cli.slam.smoothing import Evidence, Smoothed, smooth
 from bsmap_cli.slam.tracking import MATCH_FLOOR, Tracking, limited, track_scans
 from bsmap_cli.slam.upkeep import with_positive_offset
 from bsmap_cli.track import Track
@@ -28,9 +28,10 @@ def run_graph(log: ScanLog, range_sigma: float, params: SlamParams, track: Track
     closures = close_loops(tracking, range_sigma, track)
     segments = _key_segments(log, tracking.keys, range_sigma, params)
     mapped = map_lines(closures.poses, segments, params)
+    every = Evidence(closures.chain, closures.closures)
     odometry = _odometry_edges(log, tracking, closures.chain, params)
-    matches = _unexplained(log, tracking, closures, segments)
-    smoothed = smooth(closures.poses, odometry, matches, segments, mapped.lines, params.gate, params.overlap_margin)
+    distinct = Evidence(odometry, _unexplained(log, tracking, closures, segments))
+    smoothed = smooth(closures.poses, every, distinct, segments, mapped.lines, params.gate, params.overlap_margin)
     known = marginals(smoothed.information, len(smoothed.poses), len(smoothed.lines))
     trajectory = Trajectory(log.horizontal.time_ns, *_every_scan(tracking, smoothed.poses, known.poses))
     scans = log.horizontal
@@ -112,7 +113,7 @@ def _match_covariances(tracking: Tracking, heading: Array, key: IntArray) -> Arr
 
     That of a step from key scan to key scan, less its allowance for what neighbouring matches have in common.
     """
-    step = np.linalg.inv(tracking.edges.information[key]) / 12
+    step = np.linalg.inv(tracking.edges.information[key]) / 6
     R = np.zeros((len(key), 3, 3))
     R[:, 0, 0] = R[:, 1, 1] = np.cos(heading)
     R[:, 1, 0] = np.sin(heading)

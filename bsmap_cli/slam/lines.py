@@ -10,7 +10,8 @@ from bsmap_cli.params import SlamParams
 from bsmap_cli.slam import filter
 from bsmap_cli.slam.paper import line_step
 from bsmap_cli.slam.segments import Segments
-from bsmap_cli.slam.upkeep import no_landmarks, to_line_map
+from bsmap_cli.slam.shelf import EVERY, Shelf, empty_shelf, look_around, put
+from bsmap_cli.slam.upkeep import no_landmarks, with_positive_offset
 
 STEP_SPREAD = np.array([0.01, 0.01, 0.004])
 ANCHOR_SPREAD = np.array([0.05, 0.05, 0.01])
@@ -32,13 +33,17 @@ def map_lines(poses: Array, segments: Segments, params: SlamParams) -> MappedLin
     """
     n = len(poses)
     counts, nis = np.zeros((n, 3), int), np.zeros(n)
-    state, landmarks = filter.initial_state(poses[0]), no_landmarks()
+    state, landmarks, shelf = filter.initial_state(poses[0]), no_landmarks(), empty_shelf()
     step_noise, anchor = np.diag(STEP_SPREAD) ** 2, np.diag(ANCHOR_SPREAD) ** 2
     for k in range(n):
         if k > 0:
             state = filter.predict(state, se2.between(poses[k - 1], poses[k]), step_noise)
             state = filter.update_pose(state, poses[k], anchor)
+        if k % EVERY == 0:
+            state, landmarks, shelf = look_around(state, landmarks, shelf, k)
         seen = segments.of_scan(k)
         state, landmarks, matched, nis[k] = line_step(state, landmarks, seen, k, params)
-        counts[k] = len(seen.scan), len(landmarks.hits), matched
-    return MappedLines(to_line_map(state, landmarks), counts, nis)
+        counts[k] = len(seen.scan), len(landmarks.hits) + len(shelf.lines), matched
+    whole = put(Shelf(state.lines, filter.line_covariances(state), landmarks), shelf)
+    kept = whole.landmarks
+    return MappedLines(with_positive_offset(whole.lines, whole.covariances, kept.extents, kept.hits), counts, nis)

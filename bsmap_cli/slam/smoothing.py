@@ -31,7 +31,7 @@ class Smoothed(NamedTuple):
     """poses : (n, 3).  lines : (m, 2) alpha, r with n pointing away from where the robot saw them.
 
     extents : (m, 2).  hits : (m,) key scans that saw the line.  information : sparse, of all poses and lines but the
-    first pose, which is held.  scales : (3,) of the variances of odometry, matches and lines, as they came out.
+    first pose, which is held.  scales : (3,) of the variances of steps, closures and lines in it.
     """
 
     poses: Array
@@ -42,38 +42,42 @@ class Smoothed(NamedTuple):
     scales: Array
 
 
-class _Problem(NamedTuple):
-    """Odometry from key scan to key scan, matches of scans (to the next ones and at closures), lines seen."""
+class Evidence(NamedTuple):
+    """What is known of the key poses beside the lines: steps from one to the next, and closures (or other matches)."""
 
-    odometry: Edges
-    matches: Edges
+    steps: Edges
+    closures: Edges
+
+
+class _Problem(NamedTuple):
+    """All observations: steps, closures, lines seen."""
+
+    steps: Edges
+    closures: Edges
     sightings: Sightings
 
     def scaled(self, scales: Array) -> "_Problem":
-        """With the variances of odometry, matches and sightings times `scales` (3,)."""
+        """With the variances of the three parts times `scales` (3,)."""
         return _Problem(
-            _scaled(self.odometry, scales[0]),
-            _scaled(self.matches, scales[1]),
+            self.steps._replace(information=self.steps.information / scales[0]),
+            self.closures._replace(information=self.closures.information / scales[1]),
             self.sightings._replace(information=self.sightings.information / scales[2]),
         )
 
     def terms(self, poses: Array, lines: Array) -> list[Term]:
         """What each part says at these poses and lines."""
-        edges = [posegraph.edge_term(poses, part) for part in (self.odometry, self.matches)]
+        edges = [posegraph.edge_term(poses, part) for part in (self.steps, self.closures)]
         return [*edges, sighting_term(poses, lines, self.sightings)]
 
 
-def _scaled(edges: Edges, scale: float) -> Edges:
-    """Edges whose variances are `scale` times as large."""
-    return edges._replace(information=edges.information / scale)
-
-
 def smooth(
-    poses: Array, odometry: Edges, matches: Edges, segments: Segments, lines: LineMap, gate: float, margin: float
+    poses: Array, every: Evidence, distinct: Evidence, segments: Segments, lines: LineMap, gate: float, margin: float
 ) -> Smoothed:
-    """Poses (n, 3) and lines that agree best with odometry, matches and the segments of the key scans.
+    """Poses (n, 3) and lines that agree best with all evidence and with the segments of the key scans.
 
-    odometry, matches : edges.  segments : `scan` is the key pose.  gate, margin : as in the filter's association.
+    every : all that helps to find the poses; matches among it use the same points as the lines.
+    distinct : no noise twice in it; from it, at the poses found, comes the information.
+    segments : `scan` is the key pose.  gate, margin : as in the filter's association.
     """
     flip = lines.sides > 0  # back to n pointing away from the robot
     parameters = np.where(flip[:, None], lines.parameters * [1, -1] + [np.pi, 0], lines.parameters)
@@ -81,40 +85,53 @@ def smooth(
     spread, scales = POSE_SPREAD, np.ones(3)
     for _ in range(ROUNDS):
         sightings = match_all(poses, parameters, extents, segments, gate, margin, spread)
-        problem = _Problem(odometry, matches, sightings)
+        problem = _Problem(*every, sightings)
         for _ in range(ITERATIONS):
-            poses, parameters, information, largest = _iterate(poses, parameters, problem.scaled(scales))
+            information, side = _normal_equations(poses, parameters, problem.scaled(scales))
+            poses, parameters, largest = _stepped(poses, parameters, information, side)
             scales = scales * _variance_components(problem.scaled(scales), poses, parameters, information)
-            # Neighbouring matches share most of their points: that they agree does not make them better.
-            scales[1] = max(scales[1], 1.0)
-            # What odometry is off by in a few steps says little of its drift, which is systematic.
-            scales[0] = max(scales[0], LEAST_ODOMETRY_SCALE)
             if largest < 1e-5:
                 break
-        poses, parameters, information, _ = _iterate(poses, parameters, problem.scaled(scales))
         extents, hits = extents_and_hits(poses, parameters, sightings, segments)
         spread = (POSE_SPREAD[0] / 2, POSE_SPREAD[1] / 2)
+    information, scales = _honest_information(poses, parameters, _Problem(*distinct, sightings))
     return Smoothed(poses, parameters, extents, hits, information, scales)
 
 
-def _iterate(poses: Array, lines: Array, problem: _Problem) -> tuple[Array, Array, sparse.csc_matrix, float]:
-    """One step of Gauss-Newton; the normal matrix and the largest change come with it."""
+def _honest_information(poses: Array, lines: Array, problem: _Problem) -> tuple[sparse.csc_matrix, Array]:
+    """Information at the poses found, and the variances' scales (3,) that what is left of the errors there tells."""
+    scales = np.ones(3)
+    for _ in range(ITERATIONS):
+        information, _ = _normal_equations(poses, lines, problem.scaled(scales))
+        scales = scales * _variance_components(problem.scaled(scales), poses, lines, information)
+        # What odometry is off by in a few steps says little of its drift, which is systematic; and that neighbouring
+        # matches, which share most of their points, agree does not make them better.
+        scales = np.maximum(scales, [LEAST_ODOMETRY_SCALE, 1.0, 0.0])
+    return _normal_equations(poses, lines, problem.scaled(scales))[0], scales
+
+
+def _normal_equations(poses: Array, lines: Array, problem: _Problem) -> tuple[sparse.csc_matrix, Array]:
+    """Matrix and right-hand side of all unknowns but the first pose, which is held."""
     n, m = len(poses), len(lines)
     size = 3 * n + 2 * m
-    terms = problem.terms(poses, lines)
     # A line that no segment is matched to any more stays where it is.
     unseen = np.setdiff1d(np.arange(m), problem.sightings.line)
     held = 3 * n + (2 * unseen[:, None] + np.arange(2)).ravel()
     matrix = sparse.csc_matrix((np.ones(len(held)), (held, held)), shape=(size, size))
     side = np.zeros(size)
-    for term in terms:
+    for term in problem.terms(poses, lines):
         matrix = matrix + posegraph.term_matrix(term, size)
         posegraph.add_side(side, term)
-    free = sparse.csc_matrix(matrix[3:, 3:])
-    step = np.concatenate([np.zeros(3), posegraph.factorise(free).solve(side[3:])])
+    return sparse.csc_matrix(matrix[3:, 3:]), side[3:]
+
+
+def _stepped(poses: Array, lines: Array, information: sparse.csc_matrix, side: Array) -> tuple[Array, Array, float]:
+    """Poses and lines after one step of Gauss-Newton, and the largest change."""
+    step = np.concatenate([np.zeros(3), posegraph.factorise(information).solve(side)])
+    n = len(poses)
     poses, lines = poses + step[: 3 * n].reshape(-1, 3), lines + step[3 * n :].reshape(-1, 2)
     poses[:, 2] = se2.wrap(poses[:, 2])
-    return poses, lines, free, float(np.abs(step).max(initial=0.0))
+    return poses, lines, float(np.abs(step).max(initial=0.0))
 
 
 def _variance_components(problem: _Problem, poses: Array, lines: Array, information: sparse.csc_matrix) -> Array:

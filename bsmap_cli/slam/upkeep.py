@@ -8,7 +8,7 @@ from bsmap_cli.core import se2
 from bsmap_cli.core.gaussian import chi2_gate
 from bsmap_cli.core.table import take
 from bsmap_cli.model import Array, IntArray, LineMap
-from bsmap_cli.slam.filter import FilterState, constrain_equal, gather, remove
+from bsmap_cli.slam.filter import FilterState, constrain_equal, gather, line_covariances, remove
 from bsmap_cli.slam.segments import Segments
 
 JOIN_ANGLE = 0.1
@@ -147,10 +147,7 @@ def _near_lines(lines: Array, extents: Array, line: int, margin: float) -> IntAr
 
 def to_line_map(state: FilterState, landmarks: Landmarks) -> LineMap:
     """The filter's lines as they are stored in the map."""
-    parameters = state.lines.copy()
-    index = 3 + 2 * np.arange(len(parameters))[:, None] + np.arange(2)
-    rows, columns = np.maximum(index[:, :, None], index[:, None]), np.minimum(index[:, :, None], index[:, None])
-    return with_positive_offset(parameters, state.covariance[rows, columns], landmarks.extents, landmarks.hits)
+    return with_positive_offset(state.lines, line_covariances(state), landmarks.extents, landmarks.hits)
 
 
 def with_positive_offset(parameters: Array, covariances: Array, extents: Array, hits: IntArray) -> LineMap:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
+from scipy.sparse.linalg import SuperLU
 
 from bsmap_cli.core import se2
 from bsmap_cli.model import Array, IntArray, LineMap
@@ -88,8 +89,9 @@ def smooth(
         problem = _Problem(*every, sightings)
         for _ in range(ITERATIONS):
             information, side = _normal_equations(poses, parameters, problem.scaled(scales))
-            poses, parameters, largest = _stepped(poses, parameters, information, side)
-            scales = scales * _variance_components(problem.scaled(scales), poses, parameters, information)
+            factors = posegraph.factorise(information)
+            poses, parameters, largest = _stepped(poses, parameters, factors.solve(side))
+            scales = scales * _variance_components(problem.scaled(scales), poses, parameters, factors)
             if largest < 1e-5:
                 break
         extents, hits = extents_and_hits(poses, parameters, sightings, segments)
@@ -103,7 +105,8 @@ def _honest_information(poses: Array, lines: Array, problem: _Problem) -> tuple[
     scales = np.ones(3)
     for _ in range(ITERATIONS):
         information, _ = _normal_equations(poses, lines, problem.scaled(scales))
-        scales = scales * _variance_components(problem.scaled(scales), poses, lines, information)
+        factors = posegraph.factorise(information)
+        scales = scales * _variance_components(problem.scaled(scales), poses, lines, factors)
         # What odometry is off by in a few steps says little of its drift, which is systematic; and that neighbouring
         # matches, which share most of their points, agree does not make them better.
         scales = np.maximum(scales, [LEAST_ODOMETRY_SCALE, 1.0, 0.0])
@@ -125,16 +128,16 @@ def _normal_equations(poses: Array, lines: Array, problem: _Problem) -> tuple[sp
     return sparse.csc_matrix(matrix[3:, 3:]), side[3:]
 
 
-def _stepped(poses: Array, lines: Array, information: sparse.csc_matrix, side: Array) -> tuple[Array, Array, float]:
-    """Poses and lines after one step of Gauss-Newton, and the largest change."""
-    step = np.concatenate([np.zeros(3), posegraph.factorise(information).solve(side)])
+def _stepped(poses: Array, lines: Array, step: Array) -> tuple[Array, Array, float]:
+    """Poses and lines after a step of all unknowns but the first pose, and the largest change."""
+    step = np.concatenate([np.zeros(3), step])
     n = len(poses)
     poses, lines = poses + step[: 3 * n].reshape(-1, 3), lines + step[3 * n :].reshape(-1, 2)
     poses[:, 2] = se2.wrap(poses[:, 2])
     return poses, lines, float(np.abs(step).max(initial=0.0))
 
 
-def _variance_components(problem: _Problem, poses: Array, lines: Array, information: sparse.csc_matrix) -> Array:
+def _variance_components(problem: _Problem, poses: Array, lines: Array, factors: SuperLU) -> Array:
     """(3,) by how much the variances of the parts are too small (Foerstner 1979): residuals over redundancy.
 
     The redundancy of a part is its number of observations less the trace of N^-1 N_part, which random vectors of signs
@@ -142,7 +145,7 @@ def _variance_components(problem: _Problem, poses: Array, lines: Array, informat
     """
     size = 3 * len(poses) + 2 * len(lines)
     probes = np.random.default_rng(0).choice([-1.0, 1.0], size=(size - 3, PROBES))
-    solved = posegraph.factorise(information).solve(probes)
+    solved = factors.solve(probes)
     scales = np.ones(3)
     for k, term in enumerate(problem.terms(poses, lines)):
         part = posegraph.term_matrix(term, size)[3:, 3:]

@@ -82,8 +82,8 @@ class SlamParams(Checked):
     update_angle: float = parameter(
         math.radians(0.5), "Filter alone: rotation below which a scan adds nothing.", "rad", 0.0
     )
-    match_distance: float = parameter(0.02, "Movement below which a scan is not matched.", "m", 0.0)
-    match_angle: float = parameter(0.02, "Rotation below which a scan is not matched.", "rad", 0.0)
+    match_distance: float = parameter(0.05, "Movement below which a scan is not matched.", "m", 0.0)
+    match_angle: float = parameter(0.05, "Rotation below which a scan is not matched.", "rad", 0.0)
     key_distance: float = parameter(0.3, "Movement after which a scan becomes a key scan.", "m", 0.0)
     key_angle: float = parameter(0.3, "Rotation after which a scan becomes a key scan.", "rad", 0.0)
 

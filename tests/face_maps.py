@@ -54,6 +54,28 @@ def wall(name, start, end, *, heights=(0.0, 2.5), offset=0.0, sensor=1.5, pose=N
     )
 
 
+def bow(x):
+    """Shape of a bowed wall 4 m long: a parabola, 1 in the middle."""
+    return 1.0 - (x / 2.0 - 1.0) ** 2
+
+
+def bowed(surface, height):
+    """A wall from 0 to 4 m that bends by `height` metres, quadratic along x."""
+    P = surface.control_points
+    middle = P.mean(axis=0) + np.array([0.0, 2.0 * height, 0.0])
+    return BSplineSurface(
+        **{
+            **vars(surface),
+            "degree_u": 2,
+            "knots_u": np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]),
+            "control_points": np.stack([P[0], middle, P[1]]),
+            "covariance": HeightCovariance(
+                surface.covariance.directions, SIGMA**2 * np.eye(6), surface.covariance.pose
+            ),
+        }
+    )
+
+
 def floor(name, start, end, *, far=3.0, sensor=1.5):
     """Floor z = 0 over x from `start` to `end` and y from 0 to `far`."""
     x, y = np.meshgrid([start, end], [0.0, far], indexing="ij")

@@ -4,13 +4,14 @@ from functools import cache
 
 import numpy as np
 import pytest
-from face_maps import SIGMA, floor, map_of, wall, with_crease
+from face_maps import SIGMA, bow, bowed, floor, map_of, wall, with_crease
 from face_scenes import simulated_place
 
 from bsmap_cli.core.bspline import evaluate_surface
 from bsmap_cli.core.trims import inside_trims
 from bsmap_cli.core.uncertainty import sensor_covariance, surface_covariance
 from bsmap_cli.evaluate import distance_to_mesh, surface_samples
+from bsmap_cli.export.tessellation import tessellate
 from bsmap_cli.fit import fit_surfaces
 from bsmap_cli.io.surfaces_json import read_surfaces, write_surfaces
 from bsmap_cli.merge import merge_surfaces
@@ -162,6 +163,16 @@ def test_twice_the_same_map_gives_one_map_of_it_all():
 def room():
     place = simulated_place("room")
     return place, fit_surfaces(place.cloud, FitParams(method="faces"))
+
+
+def test_outline_follows_a_curved_surface():
+    """A bowed wall, seen twice: the sides of its outline are chords of its shape, so that a mesh can follow it."""
+    parts = [bowed(wall(f"{name}/1", 0.0, 4.0), 0.1) for name in "ab"]
+    (one,) = merged(*parts).surfaces
+    assert one.degree_u > 1 or one.degree_v > 1
+    mesh = tessellate(one, 0.002)
+    middle = np.column_stack([np.linspace(0.3, 3.7, 50), 0.1 * bow(np.linspace(0.3, 3.7, 50)), np.full(50, 1.0)])
+    assert distance_to_mesh(middle, mesh.vertices, mesh.triangles).max() < 0.004
 
 
 def test_room_is_there_once_and_as_true_as_before():

@@ -66,6 +66,7 @@ class Told(NamedTuple):
     uv : (m, 2) parameters in the frame of samples of its rectangle.  carry : (k, m) from heights there to its own.
     heights : (k,) its own, above the frame's plane.  root : (k, k) lower triangular, root' root = Lambda.
     covariance : (k, k) of the heights, sensor part.  by_pose : (k, 3 p), of each of its pose parts in turn.
+    basis : (m, k) back from its heights to the samples.  stiffness : 1 / metres, weight of what it cannot follow there.
     degrees, inner : along s and t of the frame, of its own spline: degrees, and knots in the frame's parameters, those
     at its ends too where it is more than bilinear.
     """
@@ -77,6 +78,8 @@ class Told(NamedTuple):
     covariance: Array
     by_pose: Array
     pose: tuple[PosePart, ...]
+    basis: Array
+    stiffness: float
     degrees: tuple[int, int]
     inner: tuple[Array, Array]
 
@@ -114,7 +117,8 @@ def tell(face: PlanarFace, frame: Frame, flatness: float) -> Told:
     grid = _grid(field.knots)
     places = field.base.place(np.column_stack([grid * (field.high - field.low), evaluate(field, grid)[0]]))
     local = frame.base.local(places)
-    carry = np.asarray(np.linalg.pinv(basis_matrix(field.knots, grid)), dtype=np.float64)
+    basis = basis_matrix(field.knots, grid)
+    carry = np.asarray(np.linalg.pinv(basis), dtype=np.float64)
     n = frame.base.axes[:, 2]
     by_pose = [carry @ _lifted(part, places, n) for part in covariance.pose]
     k = field.knots
@@ -126,7 +130,9 @@ def tell(face: PlanarFace, frame: Frame, flatness: float) -> Told:
     uv = (local[:, :2] - frame.low) / (frame.high - frame.low)
     lifts = np.concatenate(by_pose, axis=1) if by_pose else np.zeros((len(at), 0))
     degrees, inner = _knots_in(field, frame)
-    return Told(uv, carry, carry @ local[:, 2], root, covariance.matrix, lifts, covariance.pose, degrees, inner)
+    stiffness = float(np.sqrt(basis.shape[1] / basis.shape[0])) / flatness
+    heights = carry @ local[:, 2]
+    return Told(uv, carry, heights, root, covariance.matrix, lifts, covariance.pose, basis, stiffness, degrees, inner)
 
 
 def _knots_in(field: HeightField, frame: Frame) -> tuple[tuple[int, int], tuple[Array, Array]]:
@@ -220,8 +226,10 @@ def solve(told: Sequence[Told], frame: Frame, knots: Knots) -> Joined:
     wanted = [one.root @ one.heights for one in told]
     N = [one.root @ (one.carry @ basis_matrix(knots, one.uv)) for one in told]
     share = np.ones(len(told))
+    strays = [_stray(one, knots) for one in told]
+    stiff = smoothness(knots) + np.sum([stray.T @ stray for stray in strays], axis=0)
     for _ in range(3):
-        H = smoothness(knots) + sum(w * n.T @ n for w, n in zip(share, N, strict=True))
+        H = stiff + sum(w * n.T @ n for w, n in zip(share, N, strict=True))
         factor = cho_factor(H)
         c = cho_solve(factor, np.sum([w * n.T @ y for w, n, y in zip(share, N, wanted, strict=True)], axis=0))
         squares = np.array([np.sum((y - n @ c) ** 2) for n, y in zip(N, wanted, strict=True)])
@@ -231,7 +239,14 @@ def solve(told: Sequence[Told], frame: Frame, knots: Knots) -> Joined:
     field = HeightField(frame.base, frame.low, frame.high, knots, c.reshape(knots.shape))
     counts = np.array([len(y) for y in wanted])
     loss = np.where(size > ROBUST, counts * (2.0 * size - ROBUST) * ROBUST, squares)
-    return Joined(field, H, gains, float(loss.sum()) + PRICE * knots.size)
+    beyond = sum(float(np.sum((stray @ c) ** 2)) for stray in strays)
+    return Joined(field, H, gains, float(loss.sum() + beyond) + PRICE * knots.size)
+
+
+def _stray(one: Told, knots: Knots) -> Array:
+    """(m, n) from joined heights to what the face told cannot follow of them, weighted: its heights do not show it."""
+    at = basis_matrix(knots, one.uv)
+    return np.asarray(one.stiffness * (at - one.basis @ (one.carry @ at)))
 
 
 def covariance_of(joined: Joined, told: Sequence[Told]) -> HeightCovariance:

@@ -9,12 +9,15 @@ import numpy as np
 import shapely
 
 from bsmap_cli.core.bspline import evaluate_surface
+from bsmap_cli.core.polygons import simplify
 from bsmap_cli.fit.heights import HeightField, evaluate, offset
 from bsmap_cli.merge.regions import Region, loops_of, region_of, united
 from bsmap_cli.model import Array, BSplineSurface, Crease, TrimLoop
 
 TOLERANCE = 0.001
 """Metres by which a simplified outline may leave the union."""
+FINE = 0.03
+"""Metres between points of a side that is laid on a curved surface, before it is simplified."""
 ALONG = 0.003
 """Metres from a crease within which a side of the new outline runs along it."""
 FARTHEST = 0.05
@@ -93,7 +96,7 @@ def outline(
     for name, loops in zip(sets, flat, strict=True):
         by_set[name].append(region_of(loops))
     whole = united([shapely.union_all(regions) for _, regions in sorted(by_set.items())], gap)
-    rings = loops_of(whole, TOLERANCE)
+    rings = [_following(ring, field) for ring in loops_of(whole, TOLERANCE)]
     lines, pairs = _creased(flat, placed)
     loops, sides = [], []
     for ring in rings:
@@ -101,6 +104,19 @@ def outline(
         loops.append(field.base.place(np.column_stack([ring, height])))
         sides.append(_sides_along(ring, lines, pairs))
     return Outline(loops, sides)
+
+
+def _following(ring: Array, field: HeightField) -> Array:
+    """The ring with corners more where its sides, straight in the base, follow a curved surface."""
+    if field.knots.size == 4:
+        return ring
+    out = []
+    for start, end in zip(ring, np.roll(ring, -1, axis=0), strict=True):
+        share = np.linspace(0.0, 1.0, max(2, int(np.ceil(np.linalg.norm(end - start) / FINE)) + 1))
+        points = start + share[:, None] * (end - start)
+        height = evaluate(field, (points - field.low) / (field.high - field.low))[0]
+        out.append(points[simplify(np.column_stack([points, height]), TOLERANCE)][:-1])
+    return np.concatenate(out)
 
 
 def _creased(flat: Sequence[list[Array]], members: Sequence[Member]) -> tuple[Array, list[FacePair]]:

@@ -1,0 +1,148 @@
+"""What joining faces does to maps of known truth: simulate, slam, cloud, fit --method faces, merge.
+
+    python tests/bench_merge_faces.py [seeds [scene ...]]
+
+One row before and one after merging. area: square metres of all faces; seen: of the true scene with a beam's end
+within 8 cm; doubled: area that another face covers, too, within 3 cm and about parallel. mean, 95%, max: millimetres
+of samples of the map to the true scene, laid over it by the first pose and by the whole trajectory. hit: share of the
+beams' true ends within 2 cm of the map. bytes: of the map as .json.gz over 12 bytes a point of the cloud.
+"""
+
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+from scenes import simulated, true_slam_map
+from scipy.spatial import cKDTree
+
+from bsmap_cli import open3d_loader
+from bsmap_cli.cloud import make_cloud
+from bsmap_cli.evaluate import align, distance_to_mesh, surface_samples, transform_points
+from bsmap_cli.export.tessellation import tessellate
+from bsmap_cli.fit import fit_surfaces
+from bsmap_cli.io.surfaces_json import write_surfaces
+from bsmap_cli.merge import merge_surfaces
+from bsmap_cli.params import CloudParams, FitParams, MergeParams, SlamParams
+from bsmap_cli.slam import run_slam
+
+DENSITY = 400.0
+"""Samples a square metre for areas."""
+
+
+def samples_of(vertices, triangles, seed=0):
+    """Even samples (n, 3), unit normals (n, 3) and the area of a mesh."""
+    a, b, c = np.moveaxis(vertices[triangles], 1, 0)
+    cross = np.cross(b - a, c - a)
+    areas = np.linalg.norm(cross, axis=1) / 2
+    rng = np.random.default_rng(seed)
+    n = int(areas.sum() * DENSITY)
+    if n == 0:
+        return np.zeros((0, 3)), np.zeros((0, 3)), areas.sum()
+    k = rng.choice(len(areas), n, p=areas / areas.sum())
+    u, v = np.sqrt(rng.random(n))[:, None], rng.random(n)[:, None]
+    return (1 - u) * a[k] + u * (1 - v) * b[k] + u * v * c[k], cross[k] / (2 * areas[k, None]), areas.sum()
+
+
+def areas(meshes):
+    """Area of all, and what of it lies doubled: the whole less each place once."""
+    o3d = open3d_loader.load()
+    scenes = []
+    for mesh in meshes:
+        scene = o3d.t.geometry.RaycastingScene()
+        scene.add_triangles(mesh.vertices.astype(np.float32), mesh.triangles.astype(np.uint32))
+        scenes.append(scene)
+    low, high = (np.array([f(mesh.vertices, axis=0) for mesh in meshes]) for f in (np.min, np.max))
+    total = single = 0.0
+    for i, mesh in enumerate(meshes):
+        points, normals, area = samples_of(mesh.vertices, mesh.triangles)
+        layers = np.ones(len(points))
+        for j in np.flatnonzero(np.all((low < high[i] + 0.03) & (high > low[i] - 0.03), axis=1)):
+            if j != i:
+                found = scenes[j].compute_closest_points(o3d.core.Tensor(points.astype(np.float32)))
+                way = found["points"].numpy() - points
+                other = found["primitive_normals"].numpy()
+                across = np.abs(np.sum(way * normals, axis=1))
+                along = np.sqrt(np.maximum(np.sum(way**2, axis=1) - across**2, 0.0))
+                layers += (across < 0.03) & (along < 0.005) & (np.abs(np.sum(other * normals, axis=1)) > 0.9)
+        total += area
+        single += area * np.mean(1.0 / layers) if len(points) else area
+    return total, total - single
+
+
+def seen_area(simulation, ends):
+    points, _, area = samples_of(simulation.vertices, simulation.triangles)
+    return area * np.mean(cKDTree(ends).query(points, distance_upper_bound=0.08)[0] < 0.08)
+
+
+def bytes_of(surface_map):
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "map.json.gz"
+        write_surfaces(path, surface_map)
+        return path.stat().st_size
+
+
+def row(name, surface_map, simulation, cloud, poses, ends):
+    samples = surface_samples(surface_map, 0.05)
+    figures = []
+    for pose in poses:
+        d = 1e3 * distance_to_mesh(transform_points(pose, samples), simulation.vertices, simulation.triangles)
+        figures.append(f"{d.mean():6.2f} {np.quantile(d, 0.95):6.2f} {d.max():5.0f}")
+    meshes = [tessellate(surface, 0.002) for surface in surface_map.surfaces]
+    total, doubled = areas(meshes)
+    offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
+    vertices = transform_points(poses[-1], np.concatenate([mesh.vertices for mesh in meshes]))
+    triangles = np.concatenate([mesh.triangles + o for mesh, o in zip(meshes, offsets, strict=True)])
+    some = ends[:: max(1, len(ends) // 100_000)]
+    hit = np.mean(distance_to_mesh(some, vertices, triangles) < 0.02)
+    controls = sum(s.control_points.shape[0] * s.control_points.shape[1] for s in surface_map.surfaces)
+    share = bytes_of(surface_map) / (12 * len(cloud.points))
+    print(
+        f"{name:24} {len(surface_map.surfaces):5d} {controls:6d} {total:8.1f} {doubled:7.2f} {'  '.join(figures)}"
+        f" {hit:7.2%} {share:7.3%}",
+        flush=True,
+    )
+
+
+def true_ends(simulation, scene, seed):
+    """Ends of the beams without noise, at true poses, in the scene's frame."""
+    clean = simulated(scene, seed=seed, range_sigma=0.0)
+    truth = clean.truth
+    start = truth.poses[np.searchsorted(truth.time_ns, clean.log.horizontal.time_ns[0])]
+    return transform_points(start, make_cloud(true_slam_map(clean), CloudParams()).points)
+
+
+def bench(scene, seed, true_poses):
+    simulation = simulated(scene, seed=seed)
+    truth = simulation.truth
+    slam_map = true_slam_map(simulation) if true_poses else run_slam(simulation.log, SlamParams())
+    cloud = make_cloud(slam_map, CloudParams())
+    fitted = fit_surfaces(cloud, FitParams(method="faces"))
+    start = time.perf_counter()
+    merged = merge_surfaces([fitted], MergeParams())
+    seconds = time.perf_counter() - start
+    first = truth.poses[np.searchsorted(truth.time_ns, simulation.log.horizontal.time_ns[0])]
+    poses = [first, align(slam_map.trajectory, truth).pose]
+    ends = true_ends(simulation, scene, seed)
+    name = f"{scene} {seed} {'true poses' if true_poses else 'slam'}"
+    row(name, fitted, simulation, cloud, poses, ends)
+    row("  merged", merged, simulation, cloud, poses, ends)
+    reasons = Counter(d.outcome if d.outcome == "merged" else d.reason.split(" and ")[0] for d in merged.decisions)
+    print(f"  {seconds:.2f} s; seen {seen_area(simulation, ends):.1f} m2; {dict(reasons)}; {merged.notes}", flush=True)
+
+
+def main(seeds=2, *scenes):
+    print(
+        f"{'':24} {'faces':>5} {'points':>6} {'area':>8} {'doubled':>7}"
+        f" {'mean':>6} {'95%':>6} {'max':>5}  {'mean':>6} {'95%':>6} {'max':>5} {'hit':>7} {'bytes':>7}"
+    )
+    for scene in scenes or ("room", "corridor", "loop"):
+        for seed in range(int(seeds)):
+            for true_poses in (True, False):
+                bench(scene, seed, true_poses)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

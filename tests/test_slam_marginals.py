@@ -40,6 +40,11 @@ def test_every_block_is_that_of_the_dense_inverse(poses, lines):
     inverse = np.linalg.inv(information)
     np.testing.assert_array_equal(found.poses[0], 0.0)
     np.testing.assert_allclose(found.poses[1:], blocks(inverse, 0, poses - 1, 3), rtol=1e-6, atol=1e-9)
+    for k in range(poses - 2):
+        np.testing.assert_allclose(
+            found.following[k + 1], inverse[3 * k : 3 * k + 3, 3 * k + 3 : 3 * k + 6], rtol=1e-6, atol=1e-9
+        )
+    np.testing.assert_array_equal(found.following[[0, -1]], 0.0)
     np.testing.assert_allclose(found.lines, blocks(inverse, 3 * (poses - 1), lines, 2), rtol=1e-6, atol=1e-9)
 
 

@@ -11,7 +11,7 @@ from bsmap_cli.core import se2
 from bsmap_cli.model import LineMap
 from bsmap_cli.slam.posegraph import ROBUST_WIDTH, Edges
 from bsmap_cli.slam.segments import Segments
-from bsmap_cli.slam.sightings import Sightings, match_all, sighting_term
+from bsmap_cli.slam.sightings import Sightings, by_scatter, match_all, sighting_term
 from bsmap_cli.slam.smoothing import Evidence, smooth
 
 WALLS = np.array([[0.0, 4.0], [np.pi / 2, 3.0], [np.pi, 4.0], [-np.pi / 2, 3.0], [0.0, 2.0]])
@@ -176,3 +176,20 @@ def test_sides_of_lines_in_the_map_are_turned_to_the_robot_and_do_not_change_the
         sides=np.ones(len(WALLS), int),
     )
     np.testing.assert_allclose(case.smoothed(lines=flipped).poses, case.smoothed().poses, atol=1e-6)
+
+
+def test_line_whose_sightings_scatter_counts_for_less_and_the_others_stay_as_they_are():
+    """The board comes out elsewhere in every scan, as a chord of a curved wall does."""
+    case, rng = Case(0), np.random.default_rng(1)
+    segments = seen_from(case.truth, 0)
+    board = np.flatnonzero(np.arange(len(segments.scan)) % len(WALLS) == 4)
+    parameters = segments.parameters.copy()
+    parameters[board, 1] += 5 * SEEN[1] * rng.normal(size=len(board))
+    information = np.linalg.inv(segments.covariances)
+    line = np.arange(len(segments.scan)) % len(WALLS)
+    sightings = Sightings(segments.scan, line, parameters, information, np.arange(len(line)))
+    found = by_scatter(case.truth, WALLS, sightings)
+    left = found.information[:, 1, 1] / information[:, 1, 1]
+    assert left[board].max() < 0.4
+    assert left[line != 4].min() > 0.7
+    assert left.max() <= 1.0

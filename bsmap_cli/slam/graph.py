@@ -20,6 +20,8 @@ from bsmap_cli.track import Track
 NO_ODOMETRY = np.array([0.1, 0.1, 0.05])
 ODOMETRY_FLOOR = np.array([0.003, 0.003, 0.002])
 """Metres and radians by which a step between key scans may be off: as it was tracked, and by odometry at the least."""
+OWN_SHARE = 1 / 20
+"""Of the variance of a step, what a single match errs by; the rest allows for what neighbours have in common."""
 
 
 def run_graph(log: ScanLog, range_sigma: float, params: SlamParams, track: Track) -> SlamMap:
@@ -33,7 +35,7 @@ def run_graph(log: ScanLog, range_sigma: float, params: SlamParams, track: Track
     distinct = Evidence(odometry, _unexplained(log, tracking, closures, segments))
     smoothed = smooth(closures.poses, every, distinct, segments, mapped.lines, params.gate, params.overlap_margin)
     known = marginals(smoothed.information, len(smoothed.poses), len(smoothed.lines))
-    trajectory = Trajectory(log.horizontal.time_ns, *_every_scan(tracking, smoothed.poses, known.poses))
+    trajectory = Trajectory(log.horizontal.time_ns, *_every_scan(tracking, smoothed.poses, known))
     scans = log.horizontal
     statistics = _statistics(mapped, tracking.keys, len(scans.time_ns))
     return SlamMap(
@@ -86,10 +88,11 @@ def _unexplained(log: ScanLog, tracking: Tracking, closures: Closures, segments:
     return concatenate([matches, closures.closures])
 
 
-def _every_scan(tracking: Tracking, poses: Array, covariances: Array) -> tuple[Array, Array]:
+def _every_scan(tracking: Tracking, poses: Array, known: Marginals) -> tuple[Array, Array]:
     """Poses (n, 3) and covariances (n, 3, 3) of all scans from those of the key scans.
 
-    Between two key scans the tracked motion is kept; what it misses of the way to the second one is spread over it.
+    Between two key scans the tracked motion is kept; what it misses of the way to the second one is spread over it. So
+    the error is a share of either key scan's, which are correlated, and of the match's own.
     """
     n, keys, tracked = len(tracking.poses), tracking.keys, tracking.poses
     before = np.searchsorted(keys, np.arange(n), side="right") - 1
@@ -102,7 +105,9 @@ def _every_scan(tracking: Tracking, poses: Array, covariances: Array) -> tuple[A
     miss[:, 2] = se2.wrap(miss[:, 2])
     every = forward + share * miss
     every[:, 2] = se2.wrap(every[:, 2])
-    spread = covariances[before] + share[..., None] * (covariances[after] - covariances[before])
+    first, second = 1.0 - share[..., None], share[..., None]
+    cross = known.following[before] + np.swapaxes(known.following[before], 1, 2)
+    spread = first**2 * known.poses[before] + second**2 * known.poses[after] + first * second * cross
     between = (share[:, 0] > 0) & (share[:, 0] < 1)
     spread[between] += _match_covariances(tracking, every[between, 2], before[between])
     return every, spread
@@ -113,7 +118,7 @@ def _match_covariances(tracking: Tracking, heading: Array, key: IntArray) -> Arr
 
     That of a step from key scan to key scan, less its allowance for what neighbouring matches have in common.
     """
-    step = np.linalg.inv(tracking.edges.information[key]) / 6
+    step = np.linalg.inv(tracking.edges.information[key]) * OWN_SHARE
     R = np.zeros((len(key), 3, 3))
     R[:, 0, 0] = R[:, 1, 1] = np.cos(heading)
     R[:, 1, 0] = np.sin(heading)

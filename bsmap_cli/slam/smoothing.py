@@ -16,16 +16,18 @@ from bsmap_cli.model import Array, IntArray, LineMap
 from bsmap_cli.slam import posegraph
 from bsmap_cli.slam.posegraph import Edges, Term
 from bsmap_cli.slam.segments import Segments
-from bsmap_cli.slam.sightings import Sightings, extents_and_hits, match_all, sighting_term
+from bsmap_cli.slam.sightings import Sightings, by_scatter, extents_and_hits, match_all, sighting_term
 
 ROUNDS = 3
 ITERATIONS = 5
 POSE_SPREAD = (0.05, 0.015)
 """Metres and radians by which a key pose may be off when segments are matched to lines for the first time."""
 PROBES = 16
-LEAST_ODOMETRY_SCALE = 0.04
 LEAST_SCALE, MOST_SCALE = 0.02, 50.0
 """Random vectors for the trace of a large inverse; limits of what the errors' variances may be off by in one step."""
+LEAST_ODOMETRY_SCALE, LEAST_STEP_SCALE = 0.04, 0.05
+"""Least scales of the variances of odometry and of steps as they were tracked. Where hardly anything contradicts the
+steps, as along a bare corridor, they would otherwise seem exact, and lines could no longer correct them."""
 
 
 class Smoothed(NamedTuple):
@@ -84,19 +86,21 @@ def smooth(
     parameters = np.where(flip[:, None], lines.parameters * [1, -1] + [np.pi, 0], lines.parameters)
     extents = np.where(flip[:, None], -lines.extents[:, ::-1], lines.extents)
     spread, scales = POSE_SPREAD, np.ones(3)
-    for _ in range(ROUNDS):
+    for k in range(ROUNDS):
         sightings = match_all(poses, parameters, extents, segments, gate, margin, spread)
-        problem = _Problem(*every, sightings)
+        problem = _Problem(*every, sightings if k == 0 else by_scatter(poses, parameters, sightings))
         for _ in range(ITERATIONS):
             information, side = _normal_equations(poses, parameters, problem.scaled(scales))
             factors = posegraph.factorise(information)
             poses, parameters, largest = _stepped(poses, parameters, factors.solve(side))
             scales = scales * _variance_components(problem.scaled(scales), poses, parameters, factors)
+            scales = np.maximum(scales, [LEAST_STEP_SCALE, 0.0, 0.0])
             if largest < 1e-5:
                 break
         extents, hits = extents_and_hits(poses, parameters, sightings, segments)
         spread = (POSE_SPREAD[0] / 2, POSE_SPREAD[1] / 2)
-    information, scales = _honest_information(poses, parameters, _Problem(*distinct, sightings))
+    weighed = by_scatter(poses, parameters, sightings)
+    information, scales = _honest_information(poses, parameters, _Problem(*distinct, weighed))
     return Smoothed(poses, parameters, extents, hits, information, scales)
 
 

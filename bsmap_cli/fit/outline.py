@@ -24,19 +24,22 @@ class Loops(NamedTuple):
     vertices: list[list[int]]
 
 
-def outline(face: int, labels: IntArray, crossings: Crossings, uv: Array, crossing_uv: Array) -> Loops:
+def outline(
+    face: int, labels: IntArray, crossings: Crossings, uv: Array, crossing_uv: Array, believed: NDArray[np.bool_]
+) -> Loops:
     """Loops around the cells of a face, counter-clockwise in its parameters, holes clockwise.
 
     Where the cells lie mirrored in the parameters (beyond the pole of a rotation), they get loops of their own, so
     that every cell is run around counter-clockwise: a point is on the face if the loops wind around it.
 
     uv : (m, n, 2) parameters of the face's beams.  crossing_uv : (k, 2) of all crossings on this face.
+    believed : (m - 1, n - 1) cells that count.
     """
     m, n = labels.shape
     member = labels == face
     corners = np.stack([member[:-1, :-1], member[:-1, 1:], member[1:, 1:], member[1:, :-1]])
-    full = np.all(corners, axis=0)
-    mixed = np.any(corners, axis=0) & ~full
+    full = np.all(corners, axis=0) & believed
+    mixed = np.any(corners, axis=0) & ~full & believed
     quads = np.stack([uv[:-1, :-1], uv[:-1, 1:], uv[1:, 1:], uv[1:, :-1]], axis=2)
     area = np.where(full, _area(quads), 0.0)
     edges: tuple[dict[tuple[int, int], int], dict[tuple[int, int], int]] = (defaultdict(int), defaultdict(int))

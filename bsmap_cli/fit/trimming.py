@@ -3,11 +3,13 @@
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bsmap_cli.core.polygons import simplify
 from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.crossings import Crossings, find_crossings
 from bsmap_cli.fit.division import Faces
+from bsmap_cli.fit.ends import doubtful_cells, find_ends, within_ends
 from bsmap_cli.fit.heights import HeightField
 from bsmap_cli.fit.labels import feet_of
 from bsmap_cli.fit.outline import outline
@@ -37,13 +39,16 @@ def trim(grid: BeamGrid, faces: Faces) -> Trims:
     """Outlines of all faces, with few vertices, and creases stored once."""
     fields = [fitted.field for fitted in faces.fitted]
     crossings = find_crossings(grid, faces.labels, fields)
+    ends = find_ends(grid, faces.labels, crossings)
+    doubtful = doubtful_cells(grid, faces.labels, fields, crossings, ends)
+    crossings = within_ends(grid, faces.labels, fields, crossings, ends)
     creases: dict[tuple[int, ...], int] = {}
     lines: list[CreaseLine] = []
     loops = []
     for number, field in enumerate(fields):
         uv = _node_parameters(grid, faces.labels, number, field)
         at_crossings = field.parameters(field.base.local(crossings.points))
-        found = outline(number, faces.labels, crossings, uv, at_crossings)
+        found = outline(number, faces.labels, crossings, uv, at_crossings, ~doubtful)
         sides = _Sides(field, uv.reshape(-1, 2), at_crossings, crossings, creases, lines)
         loops.append([loop for vertices in found.vertices if (loop := _loop(sides, vertices)) is not None])
     return Trims(loops, lines)
@@ -54,12 +59,31 @@ def _node_parameters(grid: BeamGrid, labels: IntArray, number: int, field: Heigh
     member = labels == number
     uv = np.full((*labels.shape, 2), np.nan)
     seen = member & grid.hit
-    uv[seen] = feet_of(grid, field, seen).uv
+    feet = feet_of(grid, field, seen)
+    short = _stands_on(grid, labels, number, field)[seen] & (feet.beyond > 0.0)
+    uv[seen] = np.where(short[:, None], field.parameters(field.base.local(grid.points[seen])), feet.uv)
     for row in np.flatnonzero((member & ~grid.hit).any(axis=1)):
         at, known = np.flatnonzero(member[row] & ~grid.hit[row]), np.flatnonzero(seen[row])
         for axis in (0, 1):
             uv[row, at, axis] = np.interp(at, known, uv[row, known, axis])
     return uv
+
+
+def _stands_on(grid: BeamGrid, labels: IntArray, number: int, field: HeightField) -> NDArray[np.bool_]:
+    """(m, n) beams of a face whose neighbour in the scan hits something in front of it.
+
+    What stands on the face may begin at the beam itself: a foot behind the measured point is no part of the face.
+    """
+    member = labels == number
+    out = np.zeros_like(member)
+    for own, next_one in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:, 1:], np.s_[:, :-1])):
+        last = np.zeros_like(member)
+        last[next_one] = member[own] & ~member[next_one]
+        last &= grid.hit
+        in_front = np.zeros_like(member)
+        in_front[last] = feet_of(grid, field, last).beyond > 0.0
+        out[own] |= member[own] & in_front[next_one]
+    return out
 
 
 class _Sides(NamedTuple):

@@ -1,0 +1,227 @@
+"""Where a face ends along each scan, and what follows from it for the ground between two scans.
+
+Scans of a rotation lie 40 cm and more apart a few metres away, and a corner may stand between two of them. What the
+scans themselves tell is where each face ends: at a face that it meets, or, where it meets none, at its last beam. Two
+things follow. A crossing between two scans lies no farther than the ends of both faces: three faces meet in a point.
+And the cells between two scans do not reach through a face in which one of the scans shows them to end.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bsmap_cli.fit.beams import BeamGrid
+from bsmap_cli.fit.crossings import FARTHEST, SETTLED, Crossings
+from bsmap_cli.fit.heights import HeightField, offset
+from bsmap_cli.fit.labels import runs_of
+from bsmap_cli.model import Array, IntArray
+
+BEYOND = 0.002
+"""Metres by which a crossing lies beyond an end before it is moved back."""
+THROUGH = 0.005
+"""Metres by which a beam's foot lies beyond an end before the cells to it are doubted."""
+STEPS = 8
+FLATTEST = 0.1
+"""Least determinant of three unit normals that meet in a point."""
+
+
+class Ends(NamedTuple):
+    """Ends of the run of each beam, (2, m, n): towards lower beams, towards higher ones.
+
+    face : number of the face that it meets there, -1 where it ends openly.
+    last : its last beam with a return, -1 outside of runs.  inner : a beam well inside the run.
+    """
+
+    face: IntArray
+    last: IntArray
+    inner: IntArray
+
+
+def find_ends(grid: BeamGrid, labels: IntArray, crossings: Crossings) -> Ends:
+    """Ends of the runs of faces along the scans."""
+    m, n = labels.shape
+    face, last, inner = np.full((3, 2, m, n), -1)
+    for row, start, stop in zip(*[a.tolist() for a in runs_of(labels)[:3]], strict=True):
+        hit = start + np.flatnonzero(grid.hit[row, start:stop])
+        if not len(hit):
+            continue
+        span = slice(start, stop)
+        last[:, row, span] = np.array([[hit[0]], [hit[-1]]])
+        inner[:, row, span] = hit[len(hit) // 2]
+        if start > 0 and crossings.along[row, start - 1] >= 0:
+            face[0, row, span] = labels[row, start - 1]
+        if stop < n and crossings.along[row, stop - 1] >= 0:
+            face[1, row, span] = labels[row, stop]
+    return Ends(face, last, inner)
+
+
+def within_ends(
+    grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], crossings: Crossings, ends: Ends
+) -> Crossings:
+    """Crossings between scans, those beyond an end of one of their faces moved back to it along the crease.
+
+    Where the crease does not reach the end nearby, there is no crossing.
+    """
+    row, column = np.nonzero(crossings.across >= 0)
+    number = crossings.across[row, column]
+    points, gone = crossings.points.copy(), np.zeros(len(crossings.points), dtype=bool)
+    reach = FARTHEST * np.linalg.norm(grid.points[row, column] - grid.points[row + 1, column], axis=1)
+    for next_scan in (0, 1):
+        for side in (0, 1):
+            end = _End(grid, fields, ends, side, row + next_scan, column)
+            wrong = np.flatnonzero(end.beyond(points[number]) > BEYOND)
+            moved, settled = _meet_end(fields, crossings.faces[number[wrong]], points[number[wrong]], end, wrong)
+            settled &= np.linalg.norm(moved - crossings.points[number[wrong]], axis=1) < reach[wrong]
+            points[number[wrong[settled]]] = moved[settled]
+            gone[number[wrong[~settled]]] = True
+    across = crossings.across.copy()
+    across[row[gone[number]], column[gone[number]]] = -1
+    return crossings._replace(across=across, points=points)
+
+
+class _End:
+    """One end of the runs of k beams: the face met there, or the plane across the scan line at the last beam."""
+
+    def __init__(
+        self, grid: BeamGrid, fields: Sequence[HeightField], ends: Ends, side: int, row: IntArray, column: IntArray
+    ) -> None:
+        self.fields, self.face = fields, ends.face[side, row, column]
+        last, inner = ends.last[side, row, column], ends.inner[side, row, column]
+        self.place = grid.points[row, last]
+        within = grid.points[row, inner]
+        way = self.place - within
+        length = np.linalg.norm(way, axis=1, keepdims=True)
+        self.known = (last >= 0) & ((self.face >= 0) | (length[:, 0] > 0.0))
+        self.way = way / np.maximum(length, 1e-12)
+        value = self._values(within, np.arange(len(row)))[0]
+        self.sign = np.where(self.face >= 0, -np.sign(value), 1.0)
+
+    def beyond(self, points: Array) -> Array:
+        """(k,) metres by which points (k, 3) lie beyond the end; -inf where it is not known."""
+        value = self.sign * self._values(points, np.arange(len(points)))[0]
+        return np.asarray(np.where(self.known, value, -np.inf))
+
+    def _values(self, points: Array, at: IntArray) -> tuple[Array, Array]:
+        """(j,) distances of points (j, 3) to the ends `at` (j,), of either sign, and (j, 3) unit normals."""
+        normals = self.way[at].copy()
+        values = np.sum((points - self.place[at]) * normals, axis=1)
+        for number in np.unique(self.face[at]):
+            if number >= 0:
+                of = self.face[at] == number
+                values[of], normals[of] = offset(self.fields[number], points[of])
+        return values, normals
+
+    meet = _values
+
+
+def _meet_end(
+    fields: Sequence[HeightField], pair: IntArray, points: Array, end: _End, at: IntArray
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Points (j, 3) moved onto two faces `pair` (j, 2) and the ends `at`, by Newton's method; and which got there."""
+    good = np.ones(len(points), dtype=bool)
+    for _ in range(STEPS):
+        values, normals = _three(fields, pair, points, end, at)
+        good &= np.abs(np.linalg.det(normals)) > FLATTEST
+        normals[~good] = np.eye(3)
+        points = points - np.where(good[:, None], np.linalg.solve(normals, values[:, :, None])[:, :, 0], 0.0)
+    return points, good & (np.abs(_three(fields, pair, points, end, at)[0]).max(axis=1, initial=0.0) < SETTLED)
+
+
+def _three(
+    fields: Sequence[HeightField], pair: IntArray, points: Array, end: _End, at: IntArray
+) -> tuple[Array, Array]:
+    """(j, 3) distances to two faces and an end, (j, 3, 3) normals."""
+    values, normals = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
+    for side in (0, 1):
+        for number in np.unique(pair[:, side]):
+            of = pair[:, side] == number
+            values[of, side], normals[of, side] = offset(fields[number], points[of])
+    values[:, 2], normals[:, 2] = end.meet(points, at)
+    return values, normals
+
+
+def doubtful_cells(
+    grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], crossings: Crossings, ends: Ends
+) -> NDArray[np.bool_]:
+    """(m - 1, n - 1) cells that reach through a face in which one of their two scans shows their face to end.
+
+    A scan that passes a corner sees the face go on, its neighbour sees it end: somewhere between is the corner. Where
+    the corner's other face is seen, too, both tell where it stands, and only the cells that hold it are doubtful.
+    """
+    bad = _behind(grid, labels, fields, crossings, ends)
+    straight, rising, falling = (_through(grid, labels, fields, crossings, ends, step) for step in (0, 1, -1))
+    return np.asarray((bad | straight)[:, :-1] | (bad | straight)[:, 1:] | rising[:, :-1] | falling[:, 1:])
+
+
+def _through(
+    grid: BeamGrid,
+    labels: IntArray,
+    fields: Sequence[HeightField],
+    crossings: Crossings,
+    ends: Ends,
+    step: int,
+) -> NDArray[np.bool_]:
+    """(m - 1, n) whether a beam and the one `step` later in the next scan hit one face, with an end in between.
+
+    An end of one of the two runs, that is: the other beam lies beyond it.
+    """
+    m, n = labels.shape
+    bad = np.zeros((m - 1, n), dtype=bool)
+    own, other = slice(max(0, -step), n - max(0, step)), slice(max(0, step), n - max(0, -step))
+    same = (labels[:-1, own] == labels[1:, other]) & (labels[:-1, own] >= 0)
+    row, column = np.nonzero(same & grid.hit[:-1, own] & grid.hit[1:, other])
+    column += own.start
+    met = _corners(labels, crossings)
+    here, there = grid.points[row, column], grid.points[row + 1, column + step]
+    for side in (0, 1):
+        first, second = (_End(grid, fields, ends, side, row + k, column + k * step) for k in (0, 1))
+        a0, a1, b0, b1 = first.beyond(here), first.beyond(there), second.beyond(here), second.beyond(there)
+        corner = met[row, first.face, second.face]
+        wrong = ((first.face >= 0) & (a1 > THROUGH)) | ((second.face >= 0) & (b0 > THROUGH))
+        # The way from one beam to the other leaves the first's side before it comes to the second's.
+        leaves = (a1 > THROUGH) & (b0 > THROUGH) & (_zero(a0, a1) < _zero(b0, b1))
+        bad[row, column] |= np.where(corner, leaves, wrong)
+    return bad
+
+
+def _zero(start: Array, end: Array) -> Array:
+    """Share of the way at which a value that goes evenly from start to end is 0."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(start / (start - end))
+
+
+def _corners(labels: IntArray, crossings: Crossings) -> NDArray[np.bool_]:
+    """(m - 1, f + 1, f + 1) whether two faces, one in this scan and one in the next, meet between them."""
+    count = int(labels.max(initial=-1)) + 2
+    out = np.zeros((labels.shape[0] - 1, count, count), dtype=bool)
+    row, column = np.nonzero(crossings.across >= 0)
+    out[row, labels[row, column], labels[row + 1, column]] = True
+    return out
+
+
+def _behind(
+    grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], crossings: Crossings, ends: Ends
+) -> NDArray[np.bool_]:
+    """(m - 1, n) whether a crossing in between joins a face to one that ends it, from the wrong side.
+
+    The run of the one face shows, at its end, on which side of it the other one lies in that scan.
+    """
+    bad = np.zeros((labels.shape[0] - 1, labels.shape[1]), dtype=bool)
+    row, column = np.nonzero(crossings.across >= 0)
+    for here, there in ((0, 1), (1, 0)):
+        face, ender = labels[row + here, column], labels[row + there, column]
+        for side, step in ((0, -1), (1, 1)):
+            follows = ends.face[side, row + there, column] == face
+            r, c = row[follows], column[follows]
+            neighbour = _first_beyond(labels, ends, side, r + there, c, step)
+            end = _End(grid, fields, ends, 1 - side, r + there, neighbour)
+            wrong = (end.face == ender[follows]) & (end.beyond(grid.points[r + here, c]) > THROUGH)
+            bad[r[wrong], c[wrong]] = True
+    return bad
+
+
+def _first_beyond(labels: IntArray, ends: Ends, side: int, row: IntArray, column: IntArray, step: int) -> IntArray:
+    """First beam behind the end of the run of each beam."""
+    return np.asarray(np.clip(ends.last[side, row, column] + step, 0, labels.shape[1] - 1))

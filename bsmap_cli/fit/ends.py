@@ -150,7 +150,7 @@ def doubtful_cells(
     A scan that passes a corner sees the face go on, its neighbour sees it end: somewhere between is the corner. Where
     the corner's other face is seen, too, both tell where it stands, and only the cells that hold it are doubtful.
     """
-    bad = _behind(grid, labels, fields, crossings, ends)
+    bad = _behind(grid, labels, fields, ends)
     straight, rising, falling = (_through(grid, labels, fields, crossings, ends, step) for step in (0, 1, -1))
     return np.asarray((bad | straight)[:, :-1] | (bad | straight)[:, 1:] | rising[:, :-1] | falling[:, 1:])
 
@@ -201,15 +201,14 @@ def _corners(labels: IntArray, crossings: Crossings) -> NDArray[np.bool_]:
     return out
 
 
-def _behind(
-    grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], crossings: Crossings, ends: Ends
-) -> NDArray[np.bool_]:
-    """(m - 1, n) whether a crossing in between joins a face to one that ends it, from the wrong side.
+def _behind(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], ends: Ends) -> NDArray[np.bool_]:
+    """(m - 1, n) whether one beam hits a face, the other one a face that ends it, and the first lies beyond that.
 
     The run of the one face shows, at its end, on which side of it the other one lies in that scan.
     """
     bad = np.zeros((labels.shape[0] - 1, labels.shape[1]), dtype=bool)
-    row, column = np.nonzero(crossings.across >= 0)
+    two = (labels[:-1] != labels[1:]) & (labels[:-1] >= 0) & (labels[1:] >= 0)
+    row, column = np.nonzero(two & grid.hit[:-1] & grid.hit[1:])
     for here, there in ((0, 1), (1, 0)):
         face, ender = labels[row + here, column], labels[row + there, column]
         for side, step in ((0, -1), (1, 1)):

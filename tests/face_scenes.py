@@ -15,7 +15,7 @@ from bsmap_cli.model import PointCloud, SlamMap, Trajectory
 from bsmap_cli.params import CloudParams, SimulateParams
 from bsmap_cli.simulate import robot
 from bsmap_cli.simulate.geometry import arc, carve, join, room, upright
-from bsmap_cli.simulate.path import Path
+from bsmap_cli.simulate.path import Path, poses_at, stepwise
 from bsmap_cli.simulate.raycast import Caster
 from bsmap_cli.simulate.scenes import Scene
 from bsmap_cli.simulate.simulation import scan
@@ -66,6 +66,23 @@ def corridor_set(sigma=0.01, seed=0, scans=20, beams=541):
         SlamMap(trajectory, slam_map.lines, slam_map.statistics, scans, slam_map.horizontal_mount), CloudParams()
     )
     return Place(make(noisy), mesh.vertices, mesh.triangles, make(clean).points)
+
+
+def turning_set(mesh, start, steps=18, sigma=0.01, seed=0):
+    """A turn on the spot in steps of 5 degrees from the pose `start`: its scans lie far apart in the distance."""
+    path, times = stepwise(start, np.array([[0.0, 0.087]] * steps))
+    scene, caster = Scene(mesh, path, times), Caster(mesh)
+    noisy, clean = (
+        scan(robot.VERTICAL, scene, caster, SimulateParams(range_sigma=s), np.random.default_rng(seed))
+        for s in (sigma, 0.0)
+    )
+    trajectory = Trajectory(noisy.time_ns, poses_at(path, times), np.zeros((steps + 1, 3, 3)))
+    known = true_slam_map(simulated("room"))
+    clouds = [
+        make_cloud(SlamMap(trajectory, known.lines, known.statistics, scans, known.horizontal_mount), CloudParams())
+        for scans in (noisy, clean)
+    ]
+    return Place(clouds[0], mesh.vertices, mesh.triangles, clouds[1].points)
 
 
 def simulated_place(name, seed=0, sigma=0.01):

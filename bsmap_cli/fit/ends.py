@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.crossings import FARTHEST, SETTLED, Crossings
 from bsmap_cli.fit.heights import HeightField, offset
-from bsmap_cli.fit.labels import runs_of
+from bsmap_cli.fit.labels import feet_of, runs_of
 from bsmap_cli.model import Array, IntArray
 
 BEYOND = 0.002
@@ -57,12 +57,21 @@ def find_ends(grid: BeamGrid, labels: IntArray, crossings: Crossings) -> Ends:
     return Ends(face, last, inner)
 
 
+def on_faces(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField]) -> BeamGrid:
+    """The grid, its points moved along their beams onto their faces: without the noise."""
+    points = grid.points.copy()
+    for number, field in enumerate(fields):
+        mask = (labels == number) & grid.hit
+        points[mask] = feet_of(grid, field, mask).points
+    return grid._replace(points=points)
+
+
 def within_ends(
     grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], crossings: Crossings, ends: Ends
 ) -> Crossings:
     """Crossings between scans, those beyond an end of one of their faces moved back to it along the crease.
 
-    Where the crease does not reach the end nearby, there is no crossing.
+    Where the crease does not reach the end nearby, there is no crossing. The grid's points lie on their faces.
     """
     row, column = np.nonzero(crossings.across >= 0)
     number = crossings.across[row, column]
@@ -148,7 +157,8 @@ def doubtful_cells(
     """(m - 1, n - 1) cells that reach through a face in which one of their two scans shows their face to end.
 
     A scan that passes a corner sees the face go on, its neighbour sees it end: somewhere between is the corner. Where
-    the corner's other face is seen, too, both tell where it stands, and only the cells that hold it are doubtful.
+    the corner's other face is seen, too, both tell where it stands, and only the cells that hold it are doubtful. The
+    grid's points lie on their faces: with their noise they would seem to lie beyond.
     """
     bad = _behind(grid, labels, fields, ends)
     straight, rising, falling = (_through(grid, labels, fields, crossings, ends, step) for step in (0, 1, -1))

@@ -9,7 +9,7 @@ from bsmap_cli.core.polygons import simplify
 from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.crossings import Crossings, find_crossings
 from bsmap_cli.fit.division import Faces
-from bsmap_cli.fit.ends import doubtful_cells, find_ends, within_ends
+from bsmap_cli.fit.ends import doubtful_cells, find_ends, on_faces, within_ends
 from bsmap_cli.fit.heights import HeightField
 from bsmap_cli.fit.labels import feet_of
 from bsmap_cli.fit.outline import outline
@@ -40,8 +40,9 @@ def trim(grid: BeamGrid, faces: Faces) -> Trims:
     fields = [fitted.field for fitted in faces.fitted]
     crossings = find_crossings(grid, faces.labels, fields)
     ends = find_ends(grid, faces.labels, crossings)
-    doubtful = doubtful_cells(grid, faces.labels, fields, crossings, ends)
-    crossings = within_ends(grid, faces.labels, fields, crossings, ends)
+    clean = on_faces(grid, faces.labels, fields)
+    doubtful = doubtful_cells(clean, faces.labels, fields, crossings, ends)
+    crossings = within_ends(clean, faces.labels, fields, crossings, ends)
     creases: dict[tuple[int, ...], int] = {}
     lines: list[CreaseLine] = []
     loops = []

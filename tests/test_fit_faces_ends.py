@@ -52,7 +52,7 @@ def turns():
             yield pytest.param(cause, start, marks=marks, id=f"{cause}, start {number}")
 
 
-@pytest.mark.parametrize(("cause", "start"), turns())
+@pytest.mark.parametrize(("cause", "start"), list(turns()))
 def test_no_sample_of_a_turn_strays_from_the_truth(cause, start):
     place = turning_set(carve(CAUSES[cause]), start)
     samples = surface_samples(faces_of(place), 0.02)

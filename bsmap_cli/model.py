@@ -213,6 +213,16 @@ class PointCloud:
 
 
 @dataclass(frozen=True)
+class ScatteredCloud:
+    """Points (n, 3) in map, metres, of which nothing else is known: no scans, no beams, no poses; their order is chance."""
+
+    points: Array
+
+    def __post_init__(self) -> None:
+        _check(self, points=(None, 3))
+
+
+@dataclass(frozen=True)
 class PosePart:
     """Error that all points of a data set share, for it comes from the robot's pose.
 
@@ -347,10 +357,13 @@ class BSplineSurface:
 
 @dataclass(frozen=True)
 class DataSet:
-    """A run of vertical scans in one kind of movement, from which surfaces were fitted."""
+    """A run of vertical scans in one kind of movement, from which surfaces were fitted; or points without any order.
+
+    movement : "translation", "rotation", or "unorganised" (then without scans: first and last are 0).
+    """
 
     name: str
-    movement: str  # "translation" or "rotation"
+    movement: str
     first_scan: int
     last_scan: int
     points: int

@@ -4,11 +4,12 @@ from bsmap_cli.fit.faces import fit_faces
 from bsmap_cli.fit.movement import divide
 from bsmap_cli.fit.paper import fit_paper
 from bsmap_cli.fit.surface import fit_scan_lines
+from bsmap_cli.fit.unorganised import fit_unorganised
 from bsmap_cli.model import PointCloud, SurfaceMap
 from bsmap_cli.params import FitParams
 from bsmap_cli.track import Track, silent
 
-__all__ = ["divide", "fit_scan_lines", "fit_surfaces"]
+__all__ = ["divide", "fit_scan_lines", "fit_surfaces", "fit_unorganised"]
 
 
 def fit_surfaces(cloud: PointCloud, params: FitParams, *, track: Track = silent) -> SurfaceMap:

@@ -53,8 +53,8 @@ def outline(
         mirrored = bool(_area(at) < 0.0)
         for a, b in zip(polygon, polygon[1:] + polygon[:1], strict=True):
             _add(edges[mirrored], a, b)
-    loops = _chain(edges[False])
-    loops += [loop[::-1] for loop in _chain(edges[True])]
+    loops = chain(edges[False])
+    loops += [loop[::-1] for loop in chain(edges[True])]
     return Loops(loops)
 
 
@@ -100,7 +100,7 @@ def _share(face: int, labels: IntArray, crossings: Crossings, row: int, column: 
     return out
 
 
-def _chain(edges: dict[tuple[int, int], int]) -> list[list[int]]:
+def chain(edges: dict[tuple[int, int], int]) -> list[list[int]]:
     """Closed loops of directed edges."""
     following: dict[int, list[int]] = defaultdict(list)
     for (a, b), count in sorted(edges.items()):

@@ -24,6 +24,7 @@ from bsmap_cli.model import (
 BLOCK_TOLERANCE = 1e-3
 CORRELATION_TOLERANCE = 1e-4
 HEIGHT_TOLERANCE = 1e-6
+MOVEMENTS = ("translation", "rotation", "unorganised")
 
 
 class MalformedError(ValueError):
@@ -204,8 +205,8 @@ def _residuals(plain: dict[str, Any], where: str) -> Residuals:
 
 def _data_set(plain: Any, where: str) -> DataSet:
     name, movement = _get(plain, "name", str, where), _get(plain, "movement", str, where)
-    if movement not in ("translation", "rotation"):
-        raise MalformedError(f"{where} ({name}): movement is {movement!r}, wanted translation or rotation")
+    if movement not in MOVEMENTS:
+        raise MalformedError(f"{where} ({name}): movement is {movement!r}, wanted {', '.join(MOVEMENTS)}")
     return DataSet(name, movement, *(_count(plain, key, where) for key in ("first_scan", "last_scan", "points")))
 
 

@@ -102,7 +102,7 @@ def test_what_is_no_cloud_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="is not a PLY file"):
         read_cloud(path)
     path.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n")
-    with pytest.raises(BadInputError, match="no cloud of `bsmap cloud`; others are not read yet"):
+    with pytest.raises(BadInputError, match="no cloud of `bsmap cloud`, for it has no scan order"):
         read_cloud(path)
 
 

@@ -1,6 +1,8 @@
 """bsmap fit: point cloud -> B-spline surfaces."""
 
+import logging
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -9,6 +11,11 @@ from bsmap_cli.cli.stage import Result, beside, run_stage
 from bsmap_cli.params import FitParams
 from bsmap_cli.track import Track
 
+if TYPE_CHECKING:
+    from bsmap_cli.model import SurfaceMap
+
+logger = logging.getLogger(__name__)
+
 
 @click.command()
 @input_argument("CLOUD_PLY")
@@ -16,7 +23,10 @@ from bsmap_cli.track import Track
 @parameters(FitParams)
 @force_option
 def fit(cloud_ply: Path, output: Path | None, fit_params: FitParams, force: bool) -> None:
-    """B-spline surfaces with covariance, one for each smooth face of each movement of the robot: X.surfaces.json."""
+    """B-spline surfaces with covariance, one for each smooth face of each movement of the robot: X.surfaces.json.
+
+    Any other PLY file of points is read, too; without the order of its scans the fit is less exact.
+    """
     make_surfaces_file(cloud_ply, output or beside(cloud_ply, ".surfaces.json", [".cloud.ply"]), fit_params, force)
 
 
@@ -27,9 +37,31 @@ def make_surfaces_file(cloud_ply: Path, output: Path, fit_params: FitParams, for
         from bsmap_cli.cli.stage import map_figures
         from bsmap_cli.fit import fit_surfaces
         from bsmap_cli.io.cloud_ply import read_cloud
+        from bsmap_cli.io.points_ply import is_organised
         from bsmap_cli.io.surfaces_json import write_surfaces
 
-        surfaces = fit_surfaces(read_cloud(cloud_ply), fit_params, track=track)
-        return Result([lambda path, provenance: write_surfaces(path, surfaces, provenance)], map_figures(surfaces))
+        if is_organised(cloud_ply):
+            surfaces = fit_surfaces(read_cloud(cloud_ply), fit_params, track=track)
+            figures = map_figures(surfaces)
+        else:
+            surfaces = fit_points(cloud_ply, fit_params, track)
+            figures = map_figures(surfaces) | unorganised_figures(surfaces)
+        return Result([lambda path, provenance: write_surfaces(path, surfaces, provenance)], figures)
 
     run_stage("fit", [cloud_ply], [output], [fit_params], compute, force)
+
+
+def fit_points(path: Path, fit_params: FitParams, track: Track) -> "SurfaceMap":
+    """Surfaces of a cloud of another program, with a warning of what they lack."""
+    from bsmap_cli.fit import fit_unorganised
+    from bsmap_cli.io.points_ply import read_points
+
+    surfaces = fit_unorganised(read_points(path), fit_params, track=track)
+    logger.warning("%s has no scan order: its faces are less exact and the covariance has no pose part", path)
+    return surfaces
+
+
+def unorganised_figures(surfaces: "SurfaceMap") -> dict[str, Any]:
+    """Figures that only points without scan order have."""
+    notes = next(iter(surfaces.notes["fit"].values()))
+    return {"rest": notes["rest"], "sigma": notes["sigma"], "scan_order": "none"}

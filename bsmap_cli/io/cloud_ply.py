@@ -130,7 +130,7 @@ def _checked_facts(path: Path) -> dict[str, Any]:
         raise BadInputError(f"{path}: is not a PLY file; wanted a cloud of `bsmap cloud`")
     found = re.search(r"^comment bsmap-cloud:(.*)$", join_comments(head.decode("latin-1")), re.MULTILINE)
     if found is None:
-        raise BadInputError(f"{path}: is a PLY file, but no cloud of `bsmap cloud`; others are not read yet")
+        raise BadInputError(f"{path}: is a PLY file, but no cloud of `bsmap cloud`, for it has no scan order")
     wanted = ply_size(head)
     if wanted != size:
         raise BadInputError(

@@ -13,7 +13,7 @@ from bsmap_cli.model import Array, IntArray
 NEIGHBOURS = 8
 REACH = 1.2
 """Largest radius of a covered triangle's circle, in distances to the eighth neighbour."""
-LEAST_LOOP = 12.0
+LEAST_LOOP = 6.0
 """Squares of the spacing; smaller loops, and holes, are chance."""
 
 
@@ -37,7 +37,7 @@ def cover(flat: Array, least: float) -> list[Array]:
     loops = [places[loop] for loop in _loops(triangles)]
     wide = [(abs(area), loop) for loop in loops if abs(area := _area(loop)) > LEAST_LOOP * cell**2]
     wide.sort(key=lambda pair: -pair[0])
-    simple = (_simplified(loop, 0.4 * cell) for _, loop in wide)
+    simple = (_simplified(loop, 0.7 * cell) for _, loop in wide)
     return [loop for loop in simple if len(loop) >= 3]
 
 

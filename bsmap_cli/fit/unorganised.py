@@ -34,6 +34,8 @@ BELIEVED = 0.8
 """Share of its points that a face must fit."""
 ROUNDS = 3
 """Of dividing the points anew by the fitted surfaces; each reaches a neighbourhood farther."""
+LEVELS, FINEST = 3, 5.0
+"""Sizes of cells, each half of the one before; the finest in standard deviations of the noise."""
 CANDIDATES = 3
 """Faces among which a point chooses."""
 MOST_BLOCKS = 5000
@@ -89,26 +91,43 @@ def _distinct(points: Array) -> Array:
 
 
 def _find_faces(points: Array, scale: Scale, track: Track) -> _Division:
-    track("faces", 0, ROUNDS + 2)
+    """Faces of coarse cells first, then in what is left those of finer ones; in the end all points choose anew."""
+    labels, fitted = np.full(len(points), -1), list[Fitted]()
+    for level in range(LEVELS):
+        track("faces", level, LEVELS + 1)
+        size, rest = scale.cell / 2.0**level, np.flatnonzero(labels < 0)
+        if len(rest) < FEWEST_POINTS or (level > 0 and size < FINEST * scale.sigma):
+            break
+        new, of_rest = _grow_faces(points[rest], size, scale.sigma)
+        labels[rest] = np.where(of_rest >= 0, of_rest + len(fitted), -1)
+        fitted += new
+    track("faces", LEVELS, LEVELS + 1)
     cells = thin(points, scale.cell)
-    normals = find_normals(cells.points)
-    regions = _regions(cells, normals, scale.sigma)
-    of_cell = np.full(len(cells.points), -1)
-    for number, members in enumerate(regions):
-        of_cell[members] = number
-    labels, sigma = of_cell[cells.of_point], scale.sigma
-    fitted = [_fit(of_face, sigma, normals.normals[cells.of_point[index]]) for index, of_face in _parts(points, labels)]
-    for step in range(ROUNDS):
-        track("faces", step + 1, ROUNDS + 2)
-        labels = _divide(points, cells, normals, of_cell, fitted, sigma)
-        of_cell = _most(labels, cells, len(fitted))
+    near = _most(labels, cells, len(fitted))[find_normals(cells.points).neighbours]
+    labels = _divide(points, cells, near, fitted, scale.sigma)
     kept = np.bincount(labels[labels >= 0], minlength=len(fitted)) >= FEWEST_POINTS
     labels, fitted = _renumber(labels, kept), [fit for fit, keep in zip(fitted, kept, strict=True) if keep]
     bases = [fit.field.base for fit in fitted]
     sigma = _noise(points, labels, fitted)
     fitted = [_fit(of_face, sigma, base=base) for (_, of_face), base in zip(_parts(points, labels), bases, strict=True)]
-    track("faces", ROUNDS + 2, ROUNDS + 2)
+    track("faces", LEVELS + 1, LEVELS + 1)
     return _believed(points, _Division(labels, fitted, sigma))
+
+
+def _grow_faces(points: Array, size: float, sigma: float) -> tuple[list[Fitted], IntArray]:
+    """Faces grown from cells of side `size`, and the label (n,) of each point."""
+    cells = thin(points, size)
+    normals = find_normals(cells.points)
+    regions = _regions(cells, normals, sigma)
+    of_cell = np.full(len(cells.points), -1)
+    for number, members in enumerate(regions):
+        of_cell[members] = number
+    labels = of_cell[cells.of_point]
+    fitted = [_fit(of_face, sigma, normals.normals[cells.of_point[index]]) for index, of_face in _parts(points, labels)]
+    for _ in range(ROUNDS):
+        labels = _divide(points, cells, of_cell[normals.neighbours], fitted, sigma)
+        of_cell = _most(labels, cells, len(fitted))
+    return fitted, labels
 
 
 def _regions(cells: Cells, normals: Normals, sigma: float) -> list[IntArray]:
@@ -204,15 +223,14 @@ def _blocks(points: Array, base: Base, size: float) -> Blocks:
     return Blocks(cells.points, across, cells.counts.astype(float), row, none.astype(float), none)
 
 
-def _divide(
-    points: Array, cells: Cells, normals: Normals, of_cell: IntArray, fitted: list[Fitted], sigma: float
-) -> IntArray:
-    """Label (n,) of each point: of the faces nearby, the one that it lies on best; -1 where it lies on none."""
-    near = of_cell[normals.neighbours]
+def _divide(points: Array, cells: Cells, near: IntArray, fitted: list[Fitted], sigma: float) -> IntArray:
+    """Label (n,) of each point: of the faces nearby, the one that it lies on best; -1 where it lies on none.
+
+    near : (m, k) labels of each cell and its neighbours.
+    """
     best, labels = np.full(len(points), GATE * sigma), np.full(len(points), -1)
     for _ in range(CANDIDATES):
-        place = np.argmax(near >= 0, axis=1)
-        candidate = near[np.arange(len(near)), place]
+        candidate = near[np.arange(len(near)), np.argmax(near >= 0, axis=1)]
         near = np.where(near == candidate[:, None], -1, near)
         of_point = candidate[cells.of_point]
         off = _distances(points, of_point, fitted)

@@ -214,7 +214,10 @@ class PointCloud:
 
 @dataclass(frozen=True)
 class ScatteredCloud:
-    """Points (n, 3) in map, metres, of which nothing else is known: no scans, no beams, no poses; their order is chance."""
+    """Points without scans, beams and poses, whose order means nothing.
+
+    points : (n, 3) metres, in map.
+    """
 
     points: Array
 

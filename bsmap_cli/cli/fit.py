@@ -2,7 +2,7 @@
 
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -10,9 +10,6 @@ from bsmap_cli.cli.options import force_option, input_argument, output_option, p
 from bsmap_cli.cli.stage import Result, beside, run_stage
 from bsmap_cli.params import FitParams
 from bsmap_cli.track import Track
-
-if TYPE_CHECKING:
-    from bsmap_cli.model import SurfaceMap
 
 logger = logging.getLogger(__name__)
 
@@ -51,8 +48,8 @@ def make_surfaces_file(cloud_ply: Path, output: Path, fit_params: FitParams, for
     run_stage("fit", [cloud_ply], [output], [fit_params], compute, force)
 
 
-def fit_points(path: Path, fit_params: FitParams, track: Track) -> "SurfaceMap":
-    """Surfaces of a cloud of another program, with a warning of what they lack."""
+def fit_points(path: Path, fit_params: FitParams, track: Track) -> Any:
+    """model.SurfaceMap of a cloud of another program, with a warning of what it lacks."""
     from bsmap_cli.fit import fit_unorganised
     from bsmap_cli.io.points_ply import read_points
 
@@ -61,7 +58,7 @@ def fit_points(path: Path, fit_params: FitParams, track: Track) -> "SurfaceMap":
     return surfaces
 
 
-def unorganised_figures(surfaces: "SurfaceMap") -> dict[str, Any]:
-    """Figures that only points without scan order have."""
+def unorganised_figures(surfaces: Any) -> dict[str, Any]:
+    """Figures of a model.SurfaceMap that only points without scan order have."""
     notes = next(iter(surfaces.notes["fit"].values()))
     return {"rest": notes["rest"], "sigma": notes["sigma"], "scan_order": "none"}

@@ -4,6 +4,7 @@ What the order of scans and beams tells is not there: noise is taken to lie acro
 points end and not in a crease, and there are no poses whose errors the covariance could hold.
 """
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -69,7 +70,9 @@ def fit_unorganised(cloud: ScatteredCloud, params: FitParams, *, track: Track = 
     found = _find_faces(points, scale, track)
     surfaces = _surfaces(points, found, scale)
     if not surfaces:
-        raise BsmapError(f"no surface can be fitted: no smooth face in {len(points)} points {scale.spacing:.3g} m apart")
+        raise BsmapError(
+            f"no surface can be fitted: no smooth face in {len(points)} points {scale.spacing:.3g} m apart"
+        )
     in_faces = sum(surface.residuals.points for surface in surfaces)
     figures = {
         "points": len(points),
@@ -139,7 +142,9 @@ def _regions(cells: Cells, normals: Normals, sigma: float) -> list[IntArray]:
         bend, members = waiting.pop()
         if len(members) < FEWEST_CELLS:
             continue
-        if _spread(normals.normals[members]) < WIDEST or _is_round(cells.points[members], normals.normals[members], noise):
+        if _spread(normals.normals[members]) < WIDEST or _is_round(
+            cells.points[members], normals.normals[members], noise
+        ):
             done.append(members)
         elif bend > BEND / 8.0:
             parts = grow(cells.points, normals, members, bend / 1.5, noise)
@@ -171,7 +176,7 @@ def _parts(points: Array, labels: IntArray) -> list[tuple[IntArray, Array]]:
     """Numbers and places of the points of each face."""
     order = np.argsort(labels, kind="stable")
     edges = np.searchsorted(labels[order], np.arange(int(labels.max(initial=-1)) + 2))
-    return [(index := order[a:b], points[index]) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    return [(index := order[a:b], points[index]) for a, b in itertools.pairwise(edges)]
 
 
 def _fit(points: Array, sigma: float, normals: Array | None = None, base: Base | None = None) -> Fitted:

@@ -21,7 +21,10 @@ FARTHEST = 1e8
 
 def is_organised(path: Path | str) -> bool:
     """Whether a file says of itself that it is a cloud of `bsmap cloud`; MissingInputError where it is not there."""
-    return re.search(r"^comment bsmap-cloud:", join_comments(_head(Path(path)).decode("latin-1")), re.MULTILINE) is not None
+    return (
+        re.search(r"^comment bsmap-cloud:", join_comments(_head(Path(path)).decode("latin-1")), re.MULTILINE)
+        is not None
+    )
 
 
 def read_points(path: Path | str) -> ScatteredCloud:
@@ -32,8 +35,8 @@ def read_points(path: Path | str) -> ScatteredCloud:
     MissingInputError
         There is no such file.
     BadInputError
-        It is no PLY file, was cut, is damaged, has no x, y, z, too few points or such as are not finite; or it was made
-        by another stage of bsmap.
+        It is no PLY file, was cut, is damaged, has no x, y, z, too few points or such as are not finite; or it is a mesh,
+        or was made by another stage of bsmap.
     """
     path = Path(path)
     head = _head(path)
@@ -83,6 +86,8 @@ def _vertices(path: Path) -> NDArray[Any]:
         elements = PlyData.read(str(path))
     except (PlyParseError, ValueError, KeyError, IndexError, TypeError, OverflowError) as error:
         raise BadInputError(f"{path}: is damaged or was cut ({error})") from error
+    if any(element.name == "face" and len(element.data) for element in elements):
+        raise BadInputError(f"{path}: is a mesh; wanted a cloud of points, without the element face")
     found = [element.data for element in elements if element.name == "vertex"]
     if not found:
         names = ", ".join(element.name for element in elements) or "none"
@@ -93,5 +98,7 @@ def _vertices(path: Path) -> NDArray[Any]:
 def _coordinates(path: Path, rows: NDArray[Any]) -> NDArray[np.float64]:
     names = rows.dtype.names or ()
     if missing := [name for name in "xyz" if name not in names or rows.dtype[name].kind not in "iuf"]:
-        raise BadInputError(f"{path}: its points have no {', '.join(missing)}; their properties are: {', '.join(names)}")
+        raise BadInputError(
+            f"{path}: its points have no {', '.join(missing)}; their properties are: {', '.join(names)}"
+        )
     return np.column_stack([rows[name].astype(np.float64) for name in "xyz"])

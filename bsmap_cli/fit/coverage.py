@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from bsmap_cli.core.polygons import simplify
-from bsmap_cli.fit.growing import group
+from bsmap_cli.fit.growing import group, nearest
 from bsmap_cli.fit.outline import chain
 from bsmap_cli.model import Array, IntArray
 
@@ -21,7 +21,7 @@ def spacing_of(flat: Array) -> float:
     """Metres between points (n, 2) in a plane: side of the square that the median one has to itself."""
     k = min(NEIGHBOURS, len(flat) - 1)
     sample = flat[np.linspace(0, len(flat) - 1, min(2000, len(flat))).astype(np.int64)]
-    reach = cKDTree(flat).query(sample, k + 1)[0][:, -1]
+    reach = nearest(cKDTree(flat), sample, k + 1)[0][:, -1]
     return float(np.median(reach) * np.sqrt(np.pi / k))
 
 
@@ -49,7 +49,7 @@ def _covered(places: Array, cell: float) -> IntArray:
         triangles = Delaunay(places - places.mean(axis=0)).simplices.astype(np.int64)
     except QhullError:  # all in one line
         return np.zeros((0, 3), dtype=np.int64)
-    spread = np.maximum(cKDTree(places).query(places, NEIGHBOURS + 1)[0][:, -1], 1.5 * cell)
+    spread = np.maximum(nearest(cKDTree(places), places, NEIGHBOURS + 1)[0][:, -1], 1.5 * cell)
     a, b, c = (places[triangles[:, k]] for k in range(3))
     twice = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
     sides = np.linalg.norm(a - b, axis=1) * np.linalg.norm(b - c, axis=1) * np.linalg.norm(c - a, axis=1)

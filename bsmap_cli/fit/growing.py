@@ -65,7 +65,7 @@ def measure_scale(points: Array) -> Scale:
     sample = points[np.linspace(0, len(points) - 1, min(SAMPLES, len(points))).astype(np.int64)]
     k = min(NEIGHBOURS, len(points))
     while True:
-        reach, neighbours = tree.query(sample, k)
+        reach, neighbours = nearest(tree, sample, k)
         squares = np.maximum(_spread(points[neighbours])[0], 0.0)
         flatness = np.sqrt(squares[:, 0] / np.maximum(squares[:, 1], 1e-300))
         if np.median(flatness) < FLAT or 2 * k > min(1024, len(points) // 4):
@@ -75,6 +75,12 @@ def measure_scale(points: Array) -> Scale:
     sigma = float(np.median(np.sqrt(squares[:, 0] * k / max(k - 3, 1))))
     spacing = radius * float(np.sqrt(np.pi / k))
     return Scale(spacing, max(sigma, 1e-4 * spacing), max(2.0 * spacing, radius / 3.0))
+
+
+def nearest(tree: "cKDTree[None]", points: Array, k: int) -> tuple[Array, IntArray]:
+    """Distances and numbers (n, k) of the points of a tree next to points (n, d), ascending."""
+    distances, numbers = tree.query(points, np.arange(1, k + 1))
+    return np.asarray(distances), np.asarray(numbers, dtype=np.int64)
 
 
 def thin(points: Array, size: float) -> Cells:
@@ -109,7 +115,7 @@ def _spread(neighbourhoods: Array) -> tuple[Array, Array]:
 
 def find_normals(points: Array) -> Normals:
     """Normals of the neighbourhoods of points (m, 3)."""
-    neighbours = cKDTree(points).query(points, min(NEIGHBOURS, len(points)))[1]
+    neighbours = nearest(cKDTree(points), points, min(NEIGHBOURS, len(points)))[1]
     values, vectors = _spread(points[neighbours])
     smooth = values[:, 0] < ROUGH**2 * values[:, 1]
     return Normals(neighbours, vectors[:, :, 0], smooth)

@@ -8,6 +8,7 @@ import itertools
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bsmap_cli.errors import BsmapError, ParameterError
 from bsmap_cli.fit.blocks import Blocks
@@ -265,7 +266,7 @@ def _most(labels: IntArray, cells: Cells, faces: int) -> IntArray:
     return out
 
 
-def _renumber(labels: IntArray, kept: Array) -> IntArray:
+def _renumber(labels: IntArray, kept: NDArray[np.bool_]) -> IntArray:
     new = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1)
     return np.asarray(new[labels])
 

@@ -35,8 +35,8 @@ def read_points(path: Path | str) -> ScatteredCloud:
     MissingInputError
         There is no such file.
     BadInputError
-        It is no PLY file, was cut, is damaged, has no x, y, z, too few points or such as are not finite; or it is a mesh,
-        or was made by another stage of bsmap.
+        It is no PLY file, was cut, is damaged, has no x, y, z, too few points or such as are not finite; it is a
+        mesh, or was made by another stage of bsmap.
     """
     path = Path(path)
     head = _head(path)

@@ -34,6 +34,8 @@ GATE = 3.5
 """Standard deviations within which a point is on a face."""
 BELIEVED = 0.8
 """Share of its points that a face must fit."""
+GREEDIEST = 3.0
+"""Times its region's points that a face may have in the end: more are a jumble through which it happens to run."""
 ROUNDS = 3
 """Of dividing the points anew by the fitted surfaces; each reaches a neighbourhood farther."""
 LEVELS, FINEST = 3, 5.0
@@ -109,8 +111,7 @@ def _find_faces(points: Array, scale: Scale, track: Track) -> _Division:
     cells = thin(points, scale.cell)
     near = _most(labels, cells, len(fitted))[find_normals(cells.points).neighbours]
     labels = _divide(points, cells, near, fitted, scale.sigma)
-    kept = np.bincount(labels[labels >= 0], minlength=len(fitted)) >= FEWEST_POINTS
-    labels, fitted = _renumber(labels, kept), [fit for fit, keep in zip(fitted, kept, strict=True) if keep]
+    fitted, labels = _kept(fitted, labels, _counts(labels, len(fitted)) >= FEWEST_POINTS)
     bases = [fit.field.base for fit in fitted]
     sigma = _noise(points, labels, fitted)
     fitted = [_fit(of_face, sigma, base=base) for (_, of_face), base in zip(_parts(points, labels), bases, strict=True)]
@@ -126,12 +127,13 @@ def _grow_faces(points: Array, size: float, sigma: float) -> tuple[list[Fitted],
     of_cell = np.full(len(cells.points), -1)
     for number, members in enumerate(regions):
         of_cell[members] = number
-    labels = of_cell[cells.of_point]
+    seeds = labels = of_cell[cells.of_point]
     fitted = [_fit(of_face, sigma, normals.normals[cells.of_point[index]]) for index, of_face in _parts(points, labels)]
     for _ in range(ROUNDS):
         labels = _divide(points, cells, of_cell[normals.neighbours], fitted, sigma)
         of_cell = _most(labels, cells, len(fitted))
-    return fitted, labels
+    before, after = _counts(seeds, len(fitted)), _counts(labels, len(fitted))
+    return _kept(fitted, labels, (after >= FEWEST_POINTS) & (after <= GREEDIEST * before))
 
 
 def _regions(cells: Cells, normals: Normals, sigma: float) -> list[IntArray]:
@@ -266,9 +268,15 @@ def _most(labels: IntArray, cells: Cells, faces: int) -> IntArray:
     return out
 
 
-def _renumber(labels: IntArray, kept: NDArray[np.bool_]) -> IntArray:
+def _counts(labels: IntArray, faces: int) -> IntArray:
+    """(faces,) points of each face."""
+    return np.bincount(labels[labels >= 0], minlength=faces)
+
+
+def _kept(fitted: list[Fitted], labels: IntArray, kept: NDArray[np.bool_]) -> tuple[list[Fitted], IntArray]:
+    """Some of the faces, and the labels numbered anew."""
     new = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1)
-    return np.asarray(new[labels])
+    return [fit for fit, keep in zip(fitted, kept, strict=True) if keep], np.asarray(new[labels])
 
 
 def _noise(points: Array, labels: IntArray, fitted: list[Fitted]) -> float:
@@ -289,11 +297,9 @@ def _believed(points: Array, found: _Division) -> _Division:
     """The division without outliers, and without the faces that many of their points deny."""
     off = _distances(points, found.labels, found.fitted)
     labels = np.where(off < GATE * found.sigma, found.labels, -1)
-    number = len(found.fitted)
-    before, after = (np.bincount(x[x >= 0], minlength=number) for x in (found.labels, labels))
-    kept = (after >= BELIEVED * before) & (after >= FEWEST_POINTS)
-    fitted = [fit for fit, keep in zip(found.fitted, kept, strict=True) if keep]
-    return _Division(_renumber(labels, kept), fitted, found.sigma)
+    before, after = (_counts(x, len(found.fitted)) for x in (found.labels, labels))
+    fitted, labels = _kept(found.fitted, labels, (after >= BELIEVED * before) & (after >= FEWEST_POINTS))
+    return _Division(labels, fitted, found.sigma)
 
 
 def _surfaces(points: Array, found: _Division, scale: Scale) -> list[BSplineSurface]:

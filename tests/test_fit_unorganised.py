@@ -153,6 +153,51 @@ def test_curved_wall_gets_the_control_points_that_it_needs():
     assert 4 < found.surfaces[0].control_points.size / 3 < 40
 
 
+def test_sphere_is_divided_into_few_height_fields():
+    rng = np.random.default_rng(6)
+    points = rng.normal(size=(15_000, 3))
+    points *= (1.0 + rng.normal(0.0, 0.003, (15_000, 1))) / np.linalg.norm(points, axis=1, keepdims=True)
+    found = fit_unorganised(ScatteredCloud(points), FitParams())
+    assert 6 <= len(found.surfaces) <= 10
+    assert sum(s.residuals.points for s in found.surfaces) > 0.98 * len(points)
+    for surface in found.surfaces:
+        _, at, _, _ = samples(surface)
+        assert np.abs(np.linalg.norm(at, axis=1) - 1.0).max() < 0.01
+
+
+def test_both_sides_of_a_wall_stay_two_faces():
+    points = box_room(40_000)
+    back = points[np.abs(points[:, 1]) < 0.03] - [0.0, 0.2, 0.0]
+    found = fit_unorganised(ScatteredCloud(np.concatenate([points, back])), FitParams())
+    assert len(found.surfaces) == 7
+
+
+def test_outliers_and_a_point_far_away_change_nothing():
+    rng = np.random.default_rng(7)
+    points = box_room(30_000)
+    stray = np.concatenate([rng.uniform(-2.0, 8.0, (1000, 3)), [[1e7, 0.0, 0.0]]])
+    found = fit_unorganised(ScatteredCloud(np.concatenate([points, stray])), FitParams())
+    assert len(found.surfaces) == 6
+    assert found.notes["fit"]["set-01"]["sigma"] == pytest.approx(SIGMA, rel=0.05)
+    assert found.notes["fit"]["set-01"]["rest"] > 900
+
+
+def test_exact_points_get_a_small_noise_and_flat_faces():
+    found = fit_unorganised(ScatteredCloud(box_room(20_000, sigma=0.0)), FitParams())
+    assert len(found.surfaces) == 6
+    assert 0.0 < found.notes["fit"]["set-01"]["sigma"] < 0.001
+    assert max(s.residuals.maximum for s in found.surfaces) < 1e-4
+
+
+def test_points_in_a_jumble_are_rest():
+    """A ball full of points is no surface, however many of them a plane through it happens to meet."""
+    rng = np.random.default_rng(8)
+    jumble = rng.normal([2.0, 2.0, 1.2], 0.1, (8000, 3))
+    found = fit_unorganised(ScatteredCloud(np.concatenate([box_room(40_000), jumble])), FitParams())
+    assert len(found.surfaces) == 6
+    assert found.notes["fit"]["set-01"]["rest"] > 7900
+
+
 def test_scale_follows_spacing_and_noise():
     rng = np.random.default_rng(3)
     flat = np.column_stack([rng.random((10_000, 2)), rng.normal(0.0, 0.004, 10_000)])

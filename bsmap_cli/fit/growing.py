@@ -25,6 +25,8 @@ ROUGH = 0.25
 """Neighbourhoods less flat than this lie on an edge, or on nothing smooth."""
 BEND = np.radians(8.0)
 """Largest angle between the normals of neighbours in one region."""
+FINEST_NOISE = 0.005
+"""Of the spacing: least noise, for clouds without any."""
 MOST_CELLS = 250_000
 LARGEST_KEY = 2**20
 
@@ -74,7 +76,7 @@ def measure_scale(points: Array) -> Scale:
     radius = float(np.median(reach[:, -1]))
     sigma = float(np.median(np.sqrt(squares[:, 0] * k / max(k - 3, 1))))
     spacing = radius * float(np.sqrt(np.pi / k))
-    return Scale(spacing, max(sigma, 1e-4 * spacing), max(2.0 * spacing, radius / 3.0))
+    return Scale(spacing, max(sigma, FINEST_NOISE * spacing), max(2.0 * spacing, radius / 3.0))
 
 
 def nearest(tree: "cKDTree[None]", points: Array, k: int) -> tuple[Array, IntArray]:
@@ -95,8 +97,9 @@ def thin(points: Array, size: float) -> Cells:
 def group(points: Array, coordinates: Array, size: float) -> Cells:
     """Points (n, 3) by the cells of side `size` in which their coordinates (n, 2 or 3) lie."""
     low, high = coordinates.min(axis=0), coordinates.max(axis=0)
-    size = max(size, float((high - low).max()) / LARGEST_KEY)
     index = ((coordinates - low) / max(size, 1e-300)).astype(np.int64)
+    if float((high - low).max()) > LARGEST_KEY * size:  # a few points far away: number the rows in use
+        index = np.column_stack([np.unique(column, return_inverse=True)[1] for column in index.T])
     key = index[:, 0]
     for column in index.T[1:]:
         key = key * (LARGEST_KEY + 1) + column

@@ -14,7 +14,18 @@ from bsmap_cli.errors import BsmapError, ParameterError
 from bsmap_cli.fit.blocks import Blocks
 from bsmap_cli.fit.coverage import cover
 from bsmap_cli.fit.division import choose_base
-from bsmap_cli.fit.growing import BEND, Cells, Normals, Scale, find_normals, group, grow, measure_scale, thin
+from bsmap_cli.fit.growing import (
+    BEND,
+    FINEST_NOISE,
+    Cells,
+    Normals,
+    Scale,
+    find_normals,
+    group,
+    grow,
+    measure_scale,
+    thin,
+)
 from bsmap_cli.fit.heights import Base, CylinderBase, HeightField, flat_knots, offset, plane_base
 from bsmap_cli.fit.lowmodels import fit_cylinder_frame
 from bsmap_cli.fit.selection import Fitted, fit_heights, refit
@@ -28,7 +39,9 @@ NAME, MOVEMENT = "set-01", "unorganised"
 REMARK = "no scan order: faces end where their points end, without creases, and the covariance has no pose part"
 FEWEST_CELLS, FEWEST_POINTS = 12, 30
 """Of a face; what is smaller is left to the rest."""
-WIDEST = np.radians(40.0)
+STRICTER, TRIES = 1.5, 4
+"""How much less neighbours may bend in a region grown anew; how often one is, from the second time by direction."""
+WIDEST = np.radians(50.0)
 """Between a face's normals and their mean, for a height field over a plane."""
 GATE = 3.5
 """Standard deviations within which a point is on a face."""
@@ -113,7 +126,7 @@ def _find_faces(points: Array, scale: Scale, track: Track) -> _Division:
     labels = _divide(points, cells, near, fitted, scale.sigma)
     fitted, labels = _kept(fitted, labels, _counts(labels, len(fitted)) >= FEWEST_POINTS)
     bases = [fit.field.base for fit in fitted]
-    sigma = _noise(points, labels, fitted)
+    sigma = _noise(points, labels, fitted, FINEST_NOISE * scale.spacing)
     fitted = [_fit(of_face, sigma, base=base) for (_, of_face), base in zip(_parts(points, labels), bases, strict=True)]
     track("faces", LEVELS + 1, LEVELS + 1)
     return _believed(points, _Division(labels, fitted, sigma))
@@ -139,20 +152,35 @@ def _grow_faces(points: Array, size: float, sigma: float) -> tuple[list[Fitted],
 def _regions(cells: Cells, normals: Normals, sigma: float) -> list[IntArray]:
     """Regions that one height field can follow; those that bend too far are grown anew more strictly."""
     noise = sigma / np.sqrt(np.median(cells.counts))
-    waiting = [(BEND, part) for part in grow(cells.points, normals, np.arange(len(cells.points)), BEND, noise)]
+    waiting = [(0, part) for part in grow(cells.points, normals, np.arange(len(cells.points)), BEND, noise)]
     done = []
     while waiting:
-        bend, members = waiting.pop()
+        tries, members = waiting.pop()
         if len(members) < FEWEST_CELLS:
             continue
-        if _spread(normals.normals[members]) < WIDEST or _is_round(
-            cells.points[members], normals.normals[members], noise
-        ):
+        of_members = normals.normals[members]
+        if _spread(of_members) < WIDEST or _is_round(cells.points[members], of_members, noise):
             done.append(members)
-        elif bend > BEND / 8.0:
-            parts = grow(cells.points, normals, members, bend / 1.5, noise)
-            waiting += [(bend / 1.5, part) for part in parts]
+        elif tries < TRIES:
+            directions = _directions(of_members) if tries else np.zeros(len(members), dtype=np.int64)
+            for direction in range(3):
+                parts = grow(cells.points, normals, members[directions == direction], BEND / STRICTER, noise)
+                waiting += [(tries + 1, part) for part in parts]
     return sorted(done, key=lambda members: (-int(cells.counts[members].sum()), int(members[0])))
+
+
+def _directions(normals: Array) -> IntArray:
+    """Which of three main directions each of the normals (n, 3), of either sign, is nearest to.
+
+    The first has most normals around it, the second most of those that are far from it, the third is across both.
+    """
+    sample = normals[np.linspace(0, len(normals) - 1, min(300, len(normals))).astype(np.int64)]
+    near = np.sum(np.abs(sample @ normals.T) > np.cos(np.radians(20.0)), axis=1)
+    first = sample[np.argmax(near)]
+    second = sample[np.argmax(np.where(np.abs(sample @ first) < np.cos(np.radians(45.0)), near, -1))]
+    third = np.cross(first, second)
+    main = np.stack([first, second, third / max(float(np.linalg.norm(third)), 1e-12)])
+    return np.asarray(np.argmax(np.abs(normals @ main.T), axis=1))
 
 
 def _spread(normals: Array) -> float:
@@ -279,8 +307,8 @@ def _kept(fitted: list[Fitted], labels: IntArray, kept: NDArray[np.bool_]) -> tu
     return [fit for fit, keep in zip(fitted, kept, strict=True) if keep], np.asarray(new[labels])
 
 
-def _noise(points: Array, labels: IntArray, fitted: list[Fitted]) -> float:
-    """Metres, standard deviation of a point: as points show it, or more, where means of neighbours do."""
+def _noise(points: Array, labels: IntArray, fitted: list[Fitted], least: float) -> float:
+    """Metres, standard deviation of a point: as points show it, or more, where means of neighbours do, or `least`."""
     off, means = [], []
     for (_, of_face), fit in zip(_parts(points, labels), fitted, strict=True):
         base = fit.field.base
@@ -288,9 +316,9 @@ def _noise(points: Array, labels: IntArray, fitted: list[Fitted]) -> float:
         off.append(np.abs(offset(fit.field, of_face)[0]))
         means.append(np.abs(offset(fit.field, blocks.points)[0]) * np.sqrt(blocks.counts))
     if not off:
-        return 0.0
+        return least
     single = float(np.median(np.concatenate(off))) / 0.6745
-    return max(single, min(float(np.median(np.concatenate(means))) / 0.6745, 3.0 * single))
+    return max(least, single, min(float(np.median(np.concatenate(means))) / 0.6745, 3.0 * single))
 
 
 def _believed(points: Array, found: _Division) -> _Division:

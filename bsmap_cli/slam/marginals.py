@@ -34,14 +34,14 @@ def marginals(information: sparse.csc_matrix, poses: int, lines: int) -> Margina
     factors = factorise(information)
     known, none = np.concatenate([[0], at]), np.zeros((1, 3, 3))
     starts = 3 * (at - 1)
-    every = _between(known, np.concatenate([none, _blocks(factors, starts, starts, 3)]), poses)
-    own = (every + np.swapaxes(every, 1, 2)) / 2
     # The last pose has none after it: its own column stands there until it is set to 0.
     after = np.minimum(starts + 3, 3 * (poses - 2))
-    following = _between(known, np.concatenate([none, _blocks(factors, starts, after, 3)]), poses)
+    exact = _blocks(factors, starts, np.stack([starts, after]), 3)
+    every, following = (_between(known, np.concatenate([none, blocks]), poses) for blocks in exact)
+    own = (every + np.swapaxes(every, 1, 2)) / 2
     following[-1] = 0.0
     first_line = 3 * (poses - 1) + 2 * np.arange(lines)
-    of_lines = _blocks(factors, first_line, first_line, 2)
+    (of_lines,) = _blocks(factors, first_line, first_line[None], 2)
     return Marginals(own, following, (of_lines + np.swapaxes(of_lines, 1, 2)) / 2)
 
 
@@ -51,15 +51,16 @@ def _between(known: IntArray, blocks: Array, count: int) -> Array:
     return np.stack(columns, axis=-1).reshape(count, *blocks.shape[1:])
 
 
-def _blocks(factors: SuperLU, starts: IntArray, after: IntArray, size: int) -> Array:
-    """Blocks (k, size, size) of the inverse, whose rows begin at `starts` and columns at `after` (k,)."""
-    out = np.empty((len(starts), size, size))
+def _blocks(factors: SuperLU, starts: IntArray, columns: IntArray, size: int) -> Array:
+    """Blocks (a, k, size, size) of the inverse, whose rows begin at `starts` (k,) and columns at `columns` (a, k)."""
+    out = np.empty((*columns.shape, size, size))
     at_once = COLUMNS // size
     for first in range(0, len(starts), at_once):
-        rows, columns = (at[first : first + at_once, None] + np.arange(size) for at in (starts, after))
+        rows = starts[first : first + at_once, None] + np.arange(size)
         side = np.zeros((factors.shape[0], rows.size))
         side[rows.ravel(), np.arange(rows.size)] = 1.0
         solved = factors.solve(side).reshape(-1, *rows.shape)
-        k = np.arange(len(rows))
-        out[first : first + len(rows)] = solved[columns[:, None, :], k[:, None, None], np.arange(size)[:, None]]
+        at = columns[:, first : first + at_once, None, None] + np.arange(size)
+        k = np.arange(len(rows))[:, None, None]
+        out[:, first : first + len(rows)] = solved[at, k, np.arange(size)[:, None]]
     return out

@@ -1,4 +1,4 @@
-"""Map of the simulated room, true poses: surfaces before and after merging against the true scene.
+"""The paper's map of the simulated room, true poses: surfaces before and after merging against the true scene.
 
     python tests/bench_merge.py [seeds]
 
@@ -97,7 +97,7 @@ def main(seeds=1):
     for seed in range(seeds):
         simulation = simulated("room", seed=seed)
         cloud = make_cloud(true_slam_map(simulation), CloudParams())
-        fitted = fit_surfaces(cloud, FitParams())
+        fitted = fit_surfaces(cloud, FitParams(method="paper"))
         row(f"seed {seed} fit", fitted, simulation, cloud)
         start = time.process_time()
         result = merge_surfaces([fitted], MergeParams())

@@ -4,7 +4,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from commands import assert_caches, assert_refused, assert_usual_refusals, bsmap, process
+from commands import assert_caches, assert_refused, assert_usual_refusals, bsmap, left_over, process
 
 from bsmap_cli.io.artifact import read_provenance
 from bsmap_cli.io.surfaces_json import read_surfaces
@@ -50,3 +50,28 @@ def test_what_it_refuses(cloud, tmp_path):
 
 def test_mesh_instead_of_cloud_is_refused(made):
     assert_refused(bsmap("fit", made / "log.truth.ply", "-o", made / "never.json"), 65, "log.truth.ply")
+
+
+@pytest.mark.parametrize("ending", [".png", ".svg", ".pdf"])
+def test_picture_is_the_same_when_made_at_once_and_from_the_artifact(cloud, ending):
+    one, two = cloud.with_name("one" + ending), cloud.with_name("two" + ending)
+    assert f"{one}: picture" in bsmap("fit", cloud, "--plot", one).err
+    made = cloud.with_name("log.surfaces.json").read_bytes()
+    assert "up to date" in bsmap("fit", cloud, "--plot", two).err
+    assert cloud.with_name("log.surfaces.json").read_bytes() == made
+    assert one.read_bytes() == two.read_bytes()
+    assert one.read_bytes().startswith({".png": b"\x89PNG", ".svg": b"<?xml", ".pdf": b"%PDF"}[ending])
+    assert left_over(cloud.parent) == []
+
+
+def test_pictures_of_the_papers_surfaces(cloud):
+    pictures = [cloud.with_name("a.png"), cloud.with_name("b.svg")]
+    coarse = ("--method", "paper", "--bound-u", "0.2", "--bound-v", "0.5")
+    assert bsmap("fit", cloud, *coarse, "--plot", pictures[0], "--plot", pictures[1]).code == 0
+    assert all(path.stat().st_size > 10_000 for path in pictures)
+
+
+def test_picture_that_cannot_be_made_is_refused_before_the_work(cloud):
+    assert_refused(bsmap("fit", cloud, "--plot", cloud.with_name("a.gif")), 2, "a.gif: pictures are made as .png")
+    assert_refused(bsmap("fit", cloud, "--plot", cloud.parent / "none" / "a.png"), 73, "there is no folder")
+    assert not cloud.with_name("log.surfaces.json").exists()

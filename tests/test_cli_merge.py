@@ -4,7 +4,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from commands import assert_caches, assert_refused, assert_usual_refusals, bsmap, process
+from commands import assert_caches, assert_refused, assert_usual_refusals, bsmap, left_over, process
 
 from bsmap_cli.io.artifact import read_provenance
 from bsmap_cli.io.surfaces_json import read_surfaces
@@ -51,3 +51,28 @@ def test_what_it_refuses(surfaces, tmp_path):
     assert_usual_refusals("merge", surfaces, tmp_path)
     assert_refused(bsmap("merge", surfaces, tmp_path / "gone.json"), 66, "gone.json: no such file")
     assert_refused(bsmap("merge", surfaces, "--gate", "0.1"), 2, "gate: 0.1 is outside")
+
+
+@pytest.mark.parametrize("ending", [".png", ".svg", ".pdf"])
+def test_picture_is_the_same_when_made_at_once_and_from_the_artifact(surfaces, ending):
+    one, two = surfaces.with_name("one" + ending), surfaces.with_name("two" + ending)
+    assert f"{one}: picture" in bsmap("merge", surfaces, "--plot", one).err
+    made = surfaces.with_name("log.map.json").read_bytes()
+    assert "up to date" in bsmap("merge", surfaces, "--plot", two).err
+    assert surfaces.with_name("log.map.json").read_bytes() == made
+    assert one.read_bytes() == two.read_bytes()
+    assert one.read_bytes().startswith({".png": b"\x89PNG", ".svg": b"<?xml", ".pdf": b"%PDF"}[ending])
+    assert left_over(surfaces.parent) == []
+
+
+def test_picture_of_several_inputs_that_share_names(surfaces, tmp_path):
+    other = Path(shutil.copy(surfaces, tmp_path / "other.surfaces.json"))
+    assert bsmap("merge", surfaces, other, "--plot", tmp_path / "a.png").code == 0
+    assert (tmp_path / "a.png").stat().st_size > 10_000
+
+
+def test_picture_that_cannot_be_made_is_refused_before_the_work(surfaces):
+    name = surfaces.with_name("a.gif")
+    assert_refused(bsmap("merge", surfaces, "--plot", name), 2, "a.gif: pictures are made as .png")
+    assert_refused(bsmap("merge", surfaces, "--plot", surfaces), 2, "pictures are made as .png")
+    assert not surfaces.with_name("log.map.json").exists()

@@ -38,6 +38,10 @@ class InOrder(click.Group):
             return _reader_gone()
 
 
+AGAIN = 5.0
+"""Seconds after which a run that was asked to stop is asked again; by then it has removed its unfinished files."""
+
+
 @click.group(cls=InOrder, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.version_option(__version__, prog_name="bsmap")
 @click.option("-q", "--quiet", is_flag=True, help="Show errors only.")
@@ -60,8 +64,22 @@ for _command in (run, slam, cloud, fit, merge, export, info, import_log, simulat
 def entry_point() -> None:
     """Run the command line; every error ends in one line on stderr and its exit code."""
     # A terminated run cleans up like an interrupted one: unfinished files are removed.
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-    sys.exit(_guarded())
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _stop)
+    code = _guarded()
+    if hasattr(signal, "setitimer"):
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+    sys.exit(code)
+
+
+def _stop(number: int, _: object) -> None:
+    """End the run. Python drops an exception that arises in some callbacks, as while it loads modules: ask again."""
+    if hasattr(signal, "setitimer"):
+        signal.signal(signal.SIGALRM, lambda *_: _stop(number, None))
+        signal.setitimer(signal.ITIMER_REAL, AGAIN)
+    if number == signal.SIGINT:
+        raise KeyboardInterrupt
+    sys.exit(128 + number)
 
 
 def _guarded() -> int:

@@ -7,6 +7,7 @@ from typing import Any
 import click
 
 from bsmap_cli.cli.options import force_option, input_argument, output_option, parameters
+from bsmap_cli.cli.plots import check_plots, draw_plots, plot_option
 from bsmap_cli.cli.stage import Result, beside, run_stage
 from bsmap_cli.params import FitParams
 from bsmap_cli.track import Track
@@ -18,13 +19,19 @@ logger = logging.getLogger(__name__)
 @input_argument("CLOUD_PLY")
 @output_option
 @parameters(FitParams)
+@plot_option
 @force_option
-def fit(cloud_ply: Path, output: Path | None, fit_params: FitParams, force: bool) -> None:
+def fit(cloud_ply: Path, output: Path | None, fit_params: FitParams, plots: tuple[Path, ...], force: bool) -> None:
     """B-spline surfaces with covariance, one for each smooth face of each movement of the robot: X.surfaces.json.
 
-    Any other PLY file of points is read, too; without the order of its scans the fit is less exact.
+    Any other PLY file of points is read, too; without the order of its scans the fit is less exact, and --plot, which
+    shows scans and beams, has nothing to draw.
     """
-    make_surfaces_file(cloud_ply, output or beside(cloud_ply, ".surfaces.json", [".cloud.ply"]), fit_params, force)
+    output = output or beside(cloud_ply, ".surfaces.json", [".cloud.ply"])
+    check_plots(plots, [cloud_ply, output])
+    make_surfaces_file(cloud_ply, output, fit_params, force)
+    if plots:
+        _draw(cloud_ply, output, plots)
 
 
 def make_surfaces_file(cloud_ply: Path, output: Path, fit_params: FitParams, force: bool) -> None:
@@ -62,3 +69,12 @@ def unorganised_figures(surfaces: Any) -> dict[str, Any]:
     """Figures of a model.SurfaceMap that only points without scan order have."""
     notes = next(iter(surfaces.notes["fit"].values()))
     return {"rest": notes["rest"], "sigma": notes["sigma"], "scan_order": "none"}
+
+
+def _draw(cloud_ply: Path, output: Path, plots: tuple[Path, ...]) -> None:
+    from bsmap_cli.io.cloud_ply import read_cloud
+    from bsmap_cli.io.surfaces_json import read_surfaces
+    from bsmap_cli.picture import draw_fit
+
+    cloud, surfaces, title = read_cloud(cloud_ply), read_surfaces(output), output.name.removesuffix(".surfaces.json")
+    draw_plots(plots, lambda path, ending: draw_fit(path, ending, cloud, surfaces, title))

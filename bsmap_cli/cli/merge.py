@@ -5,6 +5,7 @@ from pathlib import Path
 import click
 
 from bsmap_cli.cli.options import force_option, input_argument, output_option, parameters
+from bsmap_cli.cli.plots import check_plots, draw_plots, plot_option
 from bsmap_cli.cli.stage import Result, beside, run_stage
 from bsmap_cli.params import MergeParams
 from bsmap_cli.track import Track
@@ -14,11 +15,21 @@ from bsmap_cli.track import Track
 @input_argument("SURFACES_JSON", many=True)
 @output_option
 @parameters(MergeParams)
+@plot_option
 @force_option
-def merge(surfaces_json: tuple[Path, ...], output: Path | None, merge_params: MergeParams, force: bool) -> None:
+def merge(
+    surfaces_json: tuple[Path, ...],
+    output: Path | None,
+    merge_params: MergeParams,
+    plots: tuple[Path, ...],
+    force: bool,
+) -> None:
     """One map: overlaps divided and fused: X.map.json (named by the first input)."""
     output = output or beside(surfaces_json[0], ".map.json", [".surfaces.json", ".map.json"])
+    check_plots(plots, [*surfaces_json, output])
     make_map_file(surfaces_json, output, merge_params, force)
+    if plots:
+        _draw(surfaces_json, output, plots)
 
 
 def make_map_file(inputs: tuple[Path, ...], output: Path, merge_params: MergeParams, force: bool) -> None:
@@ -35,3 +46,12 @@ def make_map_file(inputs: tuple[Path, ...], output: Path, merge_params: MergePar
         return Result([lambda path, provenance: write_surfaces(path, merged, provenance)], figures)
 
     run_stage("merge", list(inputs), [output], [merge_params], compute, force)
+
+
+def _draw(inputs: tuple[Path, ...], output: Path, plots: tuple[Path, ...]) -> None:
+    from bsmap_cli.io.surfaces_json import read_surfaces
+    from bsmap_cli.picture import draw_merge
+
+    before, merged = [read_surfaces(path) for path in inputs], read_surfaces(output)
+    title = output.name.removesuffix(".map.json")
+    draw_plots(plots, lambda path, ending: draw_merge(path, ending, before, merged, title))

@@ -5,9 +5,9 @@ from typing import Any
 
 import click
 
-from bsmap_cli.cli.options import force_option, input_argument, output_option, parameters, say
-from bsmap_cli.cli.stage import Result, beside, check_outputs, run_stage
-from bsmap_cli.errors import ParameterError
+from bsmap_cli.cli.options import force_option, input_argument, output_option, parameters
+from bsmap_cli.cli.plots import check_plots, draw_plots, plot_option
+from bsmap_cli.cli.stage import Result, beside, run_stage
 from bsmap_cli.params import LogParams, SlamParams
 from bsmap_cli.track import Track
 
@@ -16,10 +16,7 @@ from bsmap_cli.track import Track
 @input_argument("LOG")
 @output_option
 @parameters(LogParams, SlamParams)
-@click.option(
-    "--plot", "plots", type=click.Path(path_type=Path), multiple=True, metavar="FILE",
-    help="Picture of the result: PNG, SVG or PDF by its ending. May be given several times.",
-)  # fmt: skip
+@plot_option
 @force_option
 def slam(
     log: Path,
@@ -31,7 +28,7 @@ def slam(
 ) -> None:
     """Trajectory and line map from the horizontal laser: LOG.slam.mcap and LOG.tum."""
     output = output or beside(log, ".slam.mcap", [".mcap"])
-    _check_plots(plots, [log, output, _tum_of(output)])
+    check_plots(plots, [log, output, _tum_of(output)])
     make_slam_file(log, output, log_params, slam_params, force)
     if plots:
         _draw(output, plots)
@@ -75,21 +72,9 @@ def _figures(result: Any) -> dict[str, Any]:
     }
 
 
-def _check_plots(plots: tuple[Path, ...], taken: list[Path]) -> None:
-    """Before any work: each is of a format known, and takes no other file's place."""
-    for path in plots:
-        if path.suffix.lower() not in (".png", ".svg", ".pdf"):
-            raise ParameterError(f"{path}: pictures are made as .png, .svg and .pdf")
-    check_outputs(taken, plots)
-
-
 def _draw(output: Path, plots: tuple[Path, ...]) -> None:
-    from bsmap_cli.io.artifact import atomic_output
     from bsmap_cli.io.slam_mcap import read_slam
     from bsmap_cli.picture import draw_slam
 
-    result = read_slam(output)
-    for plot in plots:
-        with atomic_output(plot) as path:
-            draw_slam(path, plot.suffix.lower(), result, output.name.removesuffix(".slam.mcap"))
-        say(f"{plot}: picture")
+    result, title = read_slam(output), output.name.removesuffix(".slam.mcap")
+    draw_plots(plots, lambda path, ending: draw_slam(path, ending, result, title))

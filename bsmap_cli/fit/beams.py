@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bsmap_cli.core import se2
+from bsmap_cli.core.beams import beam_origins
 from bsmap_cli.model import Array, IntArray, PointCloud
 
 
@@ -40,7 +40,7 @@ def make_grid(cloud: PointCloud, scans: IntArray) -> BeamGrid:
     column = beams - first
     points, directions = np.full((2, len(kept), n, 3), np.nan)
     ranges, hit = np.full((len(kept), n), np.nan), np.zeros((len(kept), n), dtype=bool)
-    along = cloud.points[index] - _origins(cloud, index)
+    along = cloud.points[index] - beam_origins(cloud, index)
     length = np.linalg.norm(along, axis=1)
     points[row, column], ranges[row, column], hit[row, column] = cloud.points[index], length, True
     directions[row, column] = along / length[:, None]
@@ -48,13 +48,6 @@ def make_grid(cloud: PointCloud, scans: IntArray) -> BeamGrid:
     return BeamGrid(
         points, directions, ranges, np.asarray(angles, dtype=np.float64), hit, _noise(ranges, cloud.range_sigma)
     )
-
-
-def _origins(cloud: PointCloud, index: IntArray) -> Array:
-    """(k, 3) begin in map of the beams of points `index` (k,)."""
-    by_time = np.argsort(cloud.scan_time_ns, kind="stable")
-    poses = se2.interpolate(cloud.scan_time_ns[by_time], cloud.scan_poses[by_time], cloud.time_ns[index])
-    return np.column_stack([se2.transform(poses, cloud.mount[:2, 3]), np.full(len(index), cloud.mount[2, 3])])
 
 
 def _noise(ranges: Array, stated: float) -> float:

@@ -1,0 +1,175 @@
+"""Picture of a merge: the surfaces before and after, what was joined and refused, and how sure the map is."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bsmap_cli.core.bspline import evaluate_surface
+from bsmap_cli.core.trims import inside_trims
+from bsmap_cli.core.uncertainty import surface_covariance
+from bsmap_cli.model import Array, BSplineSurface, Decision, SurfaceMap
+from bsmap_cli.picture.figure import new_figure, save
+from bsmap_cli.picture.views import FRONT, PLAN, SIDEWAYS, View, box, colors, heights, outlines, set_up, shape
+
+WIDTH = 14.0
+"""Inches, of the figure: two views side by side."""
+SAMPLE, MOST_SAMPLES = 0.1, 120
+"""Metres between points at which the standard deviation is drawn, and the most of them each way of a surface."""
+STEEP = 0.5
+"""Vertical part of a normal below which a surface counts as a wall."""
+MOST_SETS = 24
+"""Data sets named in the legend."""
+
+
+class Samples(NamedTuple):
+    """points (n, 3) of the map; sigma (n,) metres, standard deviation along the normal; wall (n,) whether steep."""
+
+    points: Array
+    sigma: Array
+    wall: NDArray[np.bool_]
+
+
+def draw_merge(path: Path, ending: str, before: Sequence[SurfaceMap], merged: SurfaceMap, title: str = "") -> None:
+    """Write a picture to `path` in the format of `ending` (.png, .svg, .pdf).
+
+    before : the maps that were merged, in their order.  merged : what came out.
+    """
+    inputs = _named_as_in(merged, before)
+    drawn = [line for surface in (*inputs, *merged.surfaces) for line in outlines(surface)]
+    limits = box(drawn)
+    views = (PLAN, FRONT, SIDEWAYS)
+    tall = [height + 0.95 for height in heights(limits, WIDTH / 2 - 1.0, views, 1.2, 10.0)]
+    figure = new_figure(WIDTH, 2 * tall[0] + sum(tall[1:]) + 1.6)
+    axes = figure.subplots(4, 2, height_ratios=[*tall, tall[0]])
+    names = [data_set.name for data_set in merged.data_sets]
+    by_set = dict(zip(names, colors(len(names)), strict=True))
+    first = [by_set.get(surface.data_sets[0], "0.5") for surface in inputs]
+    for row, view in enumerate(views):
+        _draw_surfaces(axes[row, 0], view, inputs, first, limits)
+        _draw_surfaces(axes[row, 1], view, merged.surfaces, colors(len(merged.surfaces)), limits)
+    axes[0, 0].set_title(f"before: {len(inputs)} surfaces, coloured by data set", fontsize=10)
+    alone = sum(len(surface.data_sets) == 1 for surface in merged.surfaces)
+    what = f"after: {len(merged.surfaces)} surfaces, each in its colour; hatched: {alone} of one data set only"
+    axes[0, 1].set_title(what, fontsize=10)
+    _draw_legend(axes[0, 0], by_set)
+    _draw_decisions(axes[3, 0], inputs, merged.decisions, limits)
+    _draw_deviation(figure, axes[3, 1], merged.surfaces, limits)
+    if title:
+        figure.suptitle(title)
+    save(figure, path, ending)
+
+
+def _named_as_in(merged: SurfaceMap, before: Sequence[SurfaceMap]) -> list[BSplineSurface]:
+    """Surfaces of all maps, with the names that the merge gave them and their data sets where maps share some."""
+    first = [data_set.name for m in before for data_set in m.data_sets]
+    prefixed = first != [data_set.name for data_set in merged.data_sets]
+    out = []
+    for number, m in enumerate(before, start=1):
+        mark = f"{number}." if prefixed else ""
+        for surface in m.surfaces:
+            sets = tuple(mark + name for name in surface.data_sets)
+            out.append(replace(surface, name=mark + surface.name, data_sets=sets))
+    return out
+
+
+def _draw_surfaces(
+    axes: Any, view: View, surfaces: Sequence[BSplineSurface], palette: Sequence[Any], limits: Array
+) -> None:
+    """Shapes seen along an axis: the far ones first, see-through, each with its outline."""
+    from matplotlib.patches import PathPatch
+
+    depth = 3 - sum(view.axes)
+    lines = [outlines(surface) for surface in surfaces]
+    some_joined = any(len(surface.data_sets) > 1 for surface in surfaces)
+    # Seen from above, from the south (low y) and from the east (high x).
+    far = [(-1 if depth == 1 else 1) * float(np.concatenate(one)[:, depth].mean()) for one in lines]
+    for k in np.argsort(far, kind="stable"):
+        hatch = "////" if some_joined and len(surfaces[k].data_sets) == 1 else None
+        path = shape(lines[k], view)
+        axes.add_patch(PathPatch(path, facecolor=palette[k], edgecolor="none", alpha=0.25))
+        axes.add_patch(PathPatch(path, facecolor="none", edgecolor=palette[k], linewidth=1.0, hatch=hatch, alpha=0.9))
+    set_up(axes, view, limits)
+
+
+def _draw_legend(axes: Any, by_set: dict[str, Any]) -> None:
+    from matplotlib.patches import Patch
+
+    shown = list(by_set.items())[:MOST_SETS]
+    handles = [Patch(color=color, label=name) for name, color in shown]
+    if len(by_set) > MOST_SETS:
+        handles.append(Patch(color="none", label=f"and {len(by_set) - MOST_SETS} more"))
+    if handles:
+        axes.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=8, fontsize=7, frameon=False)
+
+
+def _draw_decisions(axes: Any, inputs: Sequence[BSplineSurface], decisions: Sequence[Decision], limits: Array) -> None:
+    """A line between the middles of the two surfaces of each decision, over the outlines of the input."""
+    from matplotlib.collections import LineCollection
+
+    lines = [outlines(surface) for surface in inputs]
+    flat = [line[:, :2] for one in lines for line in one]
+    axes.add_collection(LineCollection(flat, colors="0.8", linewidths=0.6, zorder=1))
+    middle = {s.name: np.concatenate(one)[:, :2].mean(axis=0) for s, one in zip(inputs, lines, strict=True)}
+    counts = []
+    for outcome, color, style, marker, what in (
+        ("merged", "tab:green", "-", "o", "joined"),
+        ("refused", "magenta", ":", "x", "refused"),
+    ):
+        some = [d for d in decisions if d.outcome == outcome]
+        ends = [[middle[d.first], middle[d.second]] for d in some if d.first in middle and d.second in middle]
+        counts.append(
+            f"{len(some)} {what} ({len(ends)} of them drawn)" if len(ends) < len(some) else f"{len(some)} {what}"
+        )
+        if ends:
+            axes.add_collection(LineCollection(ends, colors=color, linewidths=0.8, linestyles=style, zorder=2))
+            axes.plot(*np.concatenate(ends).T, marker, c=color, ms=3 if marker == "o" else 6, zorder=3, label=what)
+    set_up(axes, PLAN, limits, "decisions on pairs, between their middles: " + ", ".join(counts))
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(loc="best", fontsize=8)
+
+
+def sample_deviation(surfaces: Sequence[BSplineSurface]) -> Samples:
+    """Standard deviation along the normal, sqrt(n' C n), on a grid over each surface, inside its trims."""
+    parts = [Samples(np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=bool)), *(_sample(s) for s in surfaces)]
+    return Samples._make(np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+
+
+def _sample(surface: BSplineSurface) -> Samples:
+    P = surface.control_points
+    lengths = [np.linalg.norm(np.diff(P, axis=k), axis=2).sum(axis=k).max() for k in (0, 1)]
+    u, v = (np.linspace(0, 1, int(np.clip(length / SAMPLE, 3, MOST_SAMPLES))) for length in lengths)
+    parameters = np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2)
+    parameters = parameters[inside_trims(surface, parameters)]
+    points, Su, Sv = evaluate_surface(surface, parameters[:, 0], parameters[:, 1], 1)
+    normal = np.cross(Su, Sv)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-12)[:, None]
+    variance = np.einsum("ni,nij,nj->n", normal, surface_covariance(surface, *parameters.T), normal)
+    return Samples(points, np.sqrt(np.maximum(variance, 0.0)), np.abs(normal[:, 2]) < STEEP)
+
+
+def _draw_deviation(figure: Any, axes: Any, surfaces: Sequence[BSplineSurface], limits: Array) -> None:
+    """Over the plan: floors and ceilings as small dots below, walls as large ones; the least sure on top."""
+    samples = sample_deviation(surfaces)
+    set_up(axes, PLAN, limits, "standard deviation along the normal (large dots: walls; small: floors, ceilings)")
+    if not len(samples.sigma):
+        return
+    from matplotlib.colors import LogNorm
+    from matplotlib.ticker import LogLocator
+
+    low, high = np.percentile(1e3 * samples.sigma, [1, 99])
+    norm = LogNorm(max(low, 1e-3), max(high, 1.01 * low, 2e-3))
+    order = np.lexsort([samples.sigma, samples.wall])
+    size = np.where(samples.wall, 12.0, 2.0)[order]
+    dots = axes.scatter(
+        *samples.points[order, :2].T, c=1e3 * samples.sigma[order], s=size, norm=norm, cmap="viridis_r",
+        linewidths=0, rasterized=True,
+    )  # fmt: skip
+    ticks = LogLocator(subs=(1, 2, 5))
+    bar = figure.colorbar(dots, ax=axes, location="bottom", extend="both", shrink=0.6, aspect=50, ticks=ticks)
+    bar.ax.minorticks_off()
+    bar.ax.xaxis.set_major_formatter("{x:.3g}")
+    bar.set_label("[mm]")

@@ -33,6 +33,8 @@ def test_it_warns_and_all_commands_take_the_result(foreign):
 def test_what_it_refuses(foreign, tmp_path):
     output = tmp_path / "never.json"
     assert_refused(bsmap("fit", foreign, "--method", "paper", "-o", output), 2, "needs scan lines")
+    plot = tmp_path / "never.png"
+    assert_refused(bsmap("fit", foreign, "--plot", plot, "-o", output), 2, "has no scan order, and --plot")
     cut = tmp_path / "cut.ply"
     cut.write_bytes(foreign.read_bytes()[:-7])
     assert_refused(bsmap("fit", cut, "-o", output), 65, "cut.ply: was cut")
@@ -41,3 +43,4 @@ def test_what_it_refuses(foreign, tmp_path):
     nan = write_ply(tmp_path / "nan.ply", np.full((40, 3), np.nan))
     assert_refused(bsmap("fit", nan, "-o", output), 65, "nan.ply: 40 points are not finite")
     assert not output.exists()
+    assert not plot.exists()

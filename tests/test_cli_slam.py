@@ -2,6 +2,7 @@
 
 import signal
 import subprocess
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -194,3 +195,26 @@ def test_signal_while_running_ends_it_cleanly(tmp_path, number, code):
     assert "Traceback" not in err
     assert [file.read_text() for file in old] == ["old", "old"]
     assert left_over(tmp_path) == []
+
+
+DROPS_THE_FIRST = """
+import os, signal, sys, time, weakref
+from bsmap_cli import cli
+cli.AGAIN = 0.2
+def work():
+    thing = type("Thing", (), {})()
+    # In the callback of a weak reference, as the import system has them, Python drops exceptions.
+    gone = weakref.ref(thing, lambda _: (os.kill(os.getpid(), int(sys.argv[1])), time.sleep(0.05)))
+    del thing
+    time.sleep(10)
+cli.cli.main = lambda **_: work()
+cli.entry_point()
+"""
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_signal_that_python_drops_ends_the_run_all_the_same(number, code):
+    command = [sys.executable, "-c", DROPS_THE_FIRST, str(int(number))]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=8, check=False)
+    assert done.returncode == code, done.stderr
+    assert "Traceback" not in done.stderr

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bsmap_cli.core.polygons import simplify, winding_number
+from bsmap_cli.core.polygons import signed_area, simplify, winding_number
 
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 
@@ -40,3 +40,9 @@ def test_simplified_line_stays_within_the_tolerance():
 
 def test_straight_line_keeps_its_ends_only():
     assert simplify(np.linspace([0.0, 0.0, 0.0], [1.0, 2.0, 3.0], 50), 1e-9).sum() == 2
+
+
+def test_area_is_positive_counter_clockwise_and_keeps_its_digits_far_from_the_origin():
+    both = np.stack([2.0 * SQUARE, 2.0 * SQUARE[::-1]])
+    np.testing.assert_array_equal(signed_area(both), [4.0, -4.0])
+    np.testing.assert_array_equal(signed_area(both + 1e9), [4.0, -4.0])

@@ -66,14 +66,12 @@ def entry_point() -> None:
     # A terminated run cleans up like an interrupted one: unfinished files are removed.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _stop)
-    code = _guarded()
-    if hasattr(signal, "setitimer"):
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-    sys.exit(code)
+    sys.exit(_guarded())
 
 
 def _stop(number: int, _: object) -> None:
     """End the run. Python drops an exception that arises in some callbacks, as while it loads modules: ask again."""
+    sys.unraisablehook = lambda _: None  # nor does it print one that was dropped
     if hasattr(signal, "setitimer"):
         signal.signal(signal.SIGALRM, lambda *_: _stop(number, None))
         signal.setitimer(signal.ITIMER_REAL, AGAIN)

@@ -9,6 +9,7 @@ import click
 from bsmap_cli.cli.options import force_option, input_argument, output_option, parameters
 from bsmap_cli.cli.plots import check_plots, draw_plots, plot_option
 from bsmap_cli.cli.stage import Result, beside, run_stage
+from bsmap_cli.errors import ParameterError
 from bsmap_cli.params import FitParams
 from bsmap_cli.track import Track
 
@@ -25,10 +26,12 @@ def fit(cloud_ply: Path, output: Path | None, fit_params: FitParams, plots: tupl
     """B-spline surfaces with covariance, one for each smooth face of each movement of the robot: X.surfaces.json.
 
     Any other PLY file of points is read, too; without the order of its scans the fit is less exact, and --plot, which
-    shows scans and beams, has nothing to draw.
+    shows scans and beams, is refused.
     """
     output = output or beside(cloud_ply, ".surfaces.json", [".cloud.ply"])
     check_plots(plots, [cloud_ply, output])
+    if plots:
+        _check_scan_order(cloud_ply)
     make_surfaces_file(cloud_ply, output, fit_params, force)
     if plots:
         _draw(cloud_ply, output, plots)
@@ -69,6 +72,14 @@ def unorganised_figures(surfaces: Any) -> dict[str, Any]:
     """Figures of a model.SurfaceMap that only points without scan order have."""
     notes = next(iter(surfaces.notes["fit"].values()))
     return {"rest": notes["rest"], "sigma": notes["sigma"], "scan_order": "none"}
+
+
+def _check_scan_order(cloud_ply: Path) -> None:
+    """Before any work: a picture of scans and beams needs them."""
+    from bsmap_cli.io.points_ply import is_organised
+
+    if not is_organised(cloud_ply):
+        raise ParameterError(f"{cloud_ply}: has no scan order, and --plot shows scans and beams; leave --plot out")
 
 
 def _draw(cloud_ply: Path, output: Path, plots: tuple[Path, ...]) -> None:

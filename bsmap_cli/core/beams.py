@@ -16,7 +16,7 @@ MET = 1e-6
 """Metres between surface and beam at which they have met."""
 
 
-class Crossings(NamedTuple):
+class Meetings(NamedTuple):
     """Where beams meet a surface: parameters u, v (n,), lengths (n,) of the beams up to there, metres; nan: nowhere."""
 
     u: Array
@@ -31,8 +31,8 @@ def beam_origins(cloud: PointCloud, index: IntArray | NDArray[np.intp]) -> Array
     return np.column_stack([se2.transform(poses, cloud.mount[:2, 3]), np.full(len(index), cloud.mount[2, 3])])
 
 
-def cross(surface: Surface, origins: Array, directions: Array, u: Array, v: Array) -> Crossings:
-    """Crossings of beams with a surface, by Newton on S(u, v) - origin - t direction = 0.
+def cross(surface: Surface, origins: Array, directions: Array, u: Array, v: Array) -> Meetings:
+    """Where beams meet a surface, by Newton on S(u, v) - origin - t direction = 0.
 
     Parameters
     ----------
@@ -52,4 +52,4 @@ def cross(surface: Surface, origins: Array, directions: Array, u: Array, v: Arra
         M[~known] = np.eye(3)
         step = np.linalg.solve(M, (t[:, None] * directions - beside)[..., None])[:, :2, 0]
         uv = np.clip(uv + np.where(known[:, None], step, 0.0), 0.0, 1.0)
-    return Crossings(uv[:, 0], uv[:, 1], np.where(gap <= MET, t, np.nan))
+    return Meetings(uv[:, 0], uv[:, 1], np.where(gap <= MET, t, np.nan))

@@ -1,4 +1,4 @@
-"""Closed polygons in the plane: which points they wind around, and the same shape with fewer vertices."""
+"""Closed polygons in the plane: area, which points they wind around, and the same shape with fewer vertices."""
 
 from collections.abc import Sequence
 
@@ -8,6 +8,13 @@ from numpy.typing import NDArray
 from bsmap_cli.model import Array, IntArray
 
 POINTS_AT_ONCE = 4096
+
+
+def signed_area(polygons: Array) -> Array:
+    """Areas (...) of polygons (..., k, 2), positive where they run counter-clockwise."""
+    # From their first vertex: far from the origin the differences of products would lose digits.
+    x, y = np.moveaxis(polygons - polygons[..., :1, :], -1, 0)
+    return np.asarray(0.5 * np.sum(x * np.roll(y, -1, axis=-1) - np.roll(x, -1, axis=-1) * y, axis=-1))
 
 
 def winding_number(points: Array, polygons: Sequence[Array]) -> IntArray:

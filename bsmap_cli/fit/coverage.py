@@ -5,7 +5,7 @@ from collections import defaultdict
 import numpy as np
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
-from bsmap_cli.core.polygons import simplify
+from bsmap_cli.core.polygons import signed_area, simplify
 from bsmap_cli.fit.growing import group, nearest
 from bsmap_cli.fit.outline import chain
 from bsmap_cli.model import Array, IntArray
@@ -35,7 +35,7 @@ def cover(flat: Array, least: float) -> list[Array]:
     places = group(raised, flat, cell).points[:, :2]
     triangles = _covered(places, cell)
     loops = [places[loop] for loop in _loops(triangles)]
-    wide = [(abs(area), loop) for loop in loops if abs(area := _area(loop)) > LEAST_LOOP * cell**2]
+    wide = [(area, loop) for loop in loops if (area := abs(float(signed_area(loop)))) > LEAST_LOOP * cell**2]
     wide.sort(key=lambda pair: -pair[0])
     simple = (_simplified(loop, 0.7 * cell) for _, loop in wide)
     return [loop for loop in simple if len(loop) >= 3]
@@ -75,8 +75,3 @@ def _simplified(loop: Array, tolerance: float) -> Array:
     first, second = loop[: half + 1], np.concatenate([loop[half:], loop[:1]])
     lines = [line[simplify(line, tolerance)][:-1] for line in (first, second)]
     return np.concatenate(lines)
-
-
-def _area(polygon: Array) -> float:
-    x, y = (polygon - polygon[0]).T
-    return float(0.5 * np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))

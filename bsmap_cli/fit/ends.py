@@ -104,15 +104,15 @@ class _End:
         length = np.linalg.norm(way, axis=1, keepdims=True)
         self.known = (last >= 0) & ((self.face >= 0) | (length[:, 0] > 0.0))
         self.way = way / np.maximum(length, 1e-12)
-        value = self._values(within, np.arange(len(row)))[0]
+        value = self.values(within, np.arange(len(row)))[0]
         self.sign = np.where(self.face >= 0, -np.sign(value), 1.0)
 
     def beyond(self, points: Array) -> Array:
         """(k,) metres by which points (k, 3) lie beyond the end; -inf where it is not known."""
-        value = self.sign * self._values(points, np.arange(len(points)))[0]
+        value = self.sign * self.values(points, np.arange(len(points)))[0]
         return np.asarray(np.where(self.known, value, -np.inf))
 
-    def _values(self, points: Array, at: IntArray) -> tuple[Array, Array]:
+    def values(self, points: Array, at: IntArray) -> tuple[Array, Array]:
         """(j,) distances of points (j, 3) to the ends `at` (j,), of either sign, and (j, 3) unit normals."""
         normals = self.way[at].copy()
         values = np.sum((points - self.place[at]) * normals, axis=1)
@@ -121,8 +121,6 @@ class _End:
                 of = self.face[at] == number
                 values[of], normals[of] = offset(self.fields[number], points[of])
         return values, normals
-
-    meet = _values
 
 
 def _meet_end(
@@ -147,7 +145,7 @@ def _three(
         for number in np.unique(pair[:, side]):
             of = pair[:, side] == number
             values[of, side], normals[of, side] = offset(fields[number], points[of])
-    values[:, 2], normals[:, 2] = end.meet(points, at)
+    values[:, 2], normals[:, 2] = end.values(points, at)
     return values, normals
 
 

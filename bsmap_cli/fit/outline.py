@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bsmap_cli.core.polygons import signed_area
 from bsmap_cli.fit.crossings import Crossings
 from bsmap_cli.model import Array, IntArray
 
@@ -41,7 +42,7 @@ def outline(
     full = np.all(corners, axis=0) & believed
     mixed = np.any(corners, axis=0) & ~full & believed
     quads = np.stack([uv[:-1, :-1], uv[:-1, 1:], uv[1:, 1:], uv[1:, :-1]], axis=2)
-    area = np.where(full, _area(quads), 0.0)
+    area = np.where(full, signed_area(quads), 0.0)
     edges: tuple[dict[tuple[int, int], int], dict[tuple[int, int], int]] = (defaultdict(int), defaultdict(int))
     for mirrored in (False, True):
         _add_full(edges[mirrored], full & (area < 0.0 if mirrored else area >= 0.0), n)
@@ -50,18 +51,12 @@ def outline(
         if len(polygon) < 3:
             continue
         at = np.array([crossing_uv[v - m * n] if v >= m * n else uv[v // n, v % n] for v in polygon])
-        mirrored = bool(_area(at) < 0.0)
+        mirrored = bool(signed_area(at) < 0.0)
         for a, b in zip(polygon, polygon[1:] + polygon[:1], strict=True):
             _add(edges[mirrored], a, b)
     loops = chain(edges[False])
     loops += [loop[::-1] for loop in chain(edges[True])]
     return Loops(loops)
-
-
-def _area(polygon: Array) -> Array:
-    """Signed areas (...) of polygons (..., k, 2)."""
-    x, y = polygon[..., 0], polygon[..., 1]
-    return np.asarray(0.5 * np.sum(x * np.roll(y, -1, axis=-1) - np.roll(x, -1, axis=-1) * y, axis=-1))
 
 
 def _add(edges: dict[tuple[int, int], int], a: int, b: int) -> None:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bsmap_cli.core.polygons import simplify
+from bsmap_cli.core.polygons import signed_area, simplify
 from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.crossings import Crossings, find_crossings
 from bsmap_cli.fit.division import Faces
@@ -113,7 +113,7 @@ class _Sides(NamedTuple):
 def _loop(sides: _Sides, vertices: list[int]) -> TrimLoop | None:
     """Loop with simplified sides; None where little is left."""
     size = sides.field.high - sides.field.low
-    if abs(_area(sides.parameters(vertices) * size)) < LEAST_AREA:
+    if abs(signed_area(sides.parameters(vertices) * size)) < LEAST_AREA:
         return None
     kept: list[int] = []
     marks: list[int] = []
@@ -164,8 +164,3 @@ def _crease(sides: _Sides, run: list[int], pair: tuple[int, int]) -> tuple[int, 
         sides.creases[key] = len(sides.lines)
         sides.lines.append(CreaseLine(pair, sides.crossings.points[np.array(kept) - len(sides.uv)]))
     return sides.creases[key], kept[::-1] if turned else kept
-
-
-def _area(polygon: Array) -> float:
-    x, y = polygon.T
-    return float(0.5 * np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))

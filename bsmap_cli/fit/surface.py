@@ -33,10 +33,14 @@ class SurfaceFit(NamedTuple):
     error_v: float
 
 
-def fit_scan_lines(lines: ScanLines, params: FitParams) -> SurfaceFit:
+def fit_scan_lines(lines: ScanLines, params: FitParams, u: Array | None = None) -> SurfaceFit:
     """Fit one surface to scan lines, the paper's way.
 
     The degree across is lowered where there are not scan lines enough for it.
+
+    Parameters
+    ----------
+    u : (n,) parameters of the points, from 0 to 1 in each line; by default centripetal ones.
 
     Raises
     ------
@@ -46,7 +50,7 @@ def fit_scan_lines(lines: ScanLines, params: FitParams) -> SurfaceFit:
     if lines.n_lines < 2:
         raise BsmapError(f"a surface needs 2 scan lines, here is {lines.n_lines}")
     degree_u, degree_v = params.degree_u, min(params.degree_v, lines.n_lines - 1)
-    u = centripetal(lines.points, lines.line)
+    u = centripetal(lines.points, lines.line) if u is None else u
     rows = Rows(u, lines.line, lines.points[:, None], _allowance(lines.covariances, params)[:, None])
     along = refine_curves(rows, degree_u, params.bound_u, params.knots_per_pass)
     line_blocks, correlation_u = _propagate_along(lines, u, along, degree_u)

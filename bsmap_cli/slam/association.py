@@ -4,9 +4,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg.lapack import dposv
 
 from bsmap_cli.core import se2
 from bsmap_cli.core.gaussian import chi2_gate
+from bsmap_cli.errors import BsmapError
 from bsmap_cli.model import Array, IntArray
 from bsmap_cli.slam.filter import FilterState, expected_lines, gather, line_jacobians
 from bsmap_cli.slam.segments import Segments
@@ -32,7 +34,10 @@ class Candidates(NamedTuple):
         """Squared Mahalanobis distance of the hypothesis that holds these pairs."""
         index = np.array([i for p in pairs for i in (2 * p, 2 * p + 1)])
         v = self.innovation[index]
-        return float(v @ np.linalg.solve(self.covariance[np.ix_(index, index)], v))
+        solved, failed = dposv(self.covariance[index[:, None], index], v)[1:]
+        if failed:
+            raise BsmapError("the joint covariance of matched lines is no longer positive definite")
+        return float(v @ solved)
 
     def of_segment(self) -> dict[int, list[int]]:
         """Pairs of each segment that has any, nearest first."""
@@ -91,10 +96,10 @@ def _innovations(state: FilterState, segments: Segments, segment: IntArray, line
     index = np.r_[np.arange(3), (3 + 2 * lines[:, None] + np.arange(2)).ravel()]
     P = gather(state.covariance, index)
     H = np.zeros((k, 2, len(index)))
-    for pair in range(k):
-        by_pose, by_line = line_jacobians(state.pose, state.lines[line[pair], 0])
-        at = 3 + 2 * column[pair]
-        H[pair, :, :3], H[pair, :, at : at + 2] = by_pose, by_line
+    by_pose, by_line = line_jacobians(state.pose, state.lines[line, 0])
+    pair, at = np.arange(k), 3 + 2 * column
+    H[..., :3] = by_pose
+    H[pair, :, at], H[pair, :, at + 1] = by_line[..., 0], by_line[..., 1]
     innovation = segments.parameters[segment] - expected_lines(state.pose, state.lines[line])
     innovation[:, 0] = se2.wrap(innovation[:, 0])
     flat = H.reshape(2 * k, -1)

@@ -8,8 +8,8 @@ buffers: a state given to one of them must not be used afterwards, only the one 
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_triangular
-from scipy.linalg.blas import dsyrk
+from scipy.linalg.blas import dsyrk, dtrsm, dtrsv
+from scipy.linalg.lapack import dpotrf
 
 from bsmap_cli.core import se2
 from bsmap_cli.errors import BsmapError
@@ -89,11 +89,17 @@ def expected_lines(pose: Array, lines: Array) -> Array:
     return np.stack([se2.wrap(alpha - pose[2]), seen_r], axis=1)
 
 
-def line_jacobians(pose: Array, alpha: float) -> tuple[Array, Array]:
-    """Derivatives of `expected_lines` by the pose (2, 3) and by the line (2, 2), Eq. (10)."""
+def line_jacobians(pose: Array, alpha: Array) -> tuple[Array, Array]:
+    """Derivatives of `expected_lines` by the pose (..., 2, 3) and by the line (..., 2, 2), Eq. (10).
+
+    alpha : (...), of the map lines.
+    """
     c, s = np.cos(alpha), np.sin(alpha)
-    by_pose = np.array([[0.0, 0.0, -1.0], [-c, -s, 0.0]])
-    by_line = np.array([[1.0, 0.0], [pose[0] * s - pose[1] * c, 1.0]])
+    by_pose, by_line = np.zeros((*c.shape, 2, 3)), np.zeros((*c.shape, 2, 2))
+    by_pose[..., 0, 2] = -1.0
+    by_pose[..., 1, 0], by_pose[..., 1, 1] = -c, -s
+    by_line[..., 0, 0] = by_line[..., 1, 1] = 1.0
+    by_line[..., 1, 0] = pose[0] * s - pose[1] * c
     return by_pose, by_line
 
 
@@ -131,13 +137,12 @@ def update_pose(state: FilterState, pose: Array, noise: Array) -> FilterState:
 
 def _correct(state: FilterState, cross: Array, S: Array, innovation: Array) -> tuple[FilterState, float]:
     """State corrected by an innovation (k,) with covariance S (k, k); cross : (size, k) = P H'."""
-    try:
-        L = np.linalg.cholesky((S + S.T) / 2)
-    except np.linalg.LinAlgError as error:
-        raise BsmapError("the filter's innovation covariance is no longer positive definite") from error
-    whitened = solve_triangular(L, innovation, lower=True, check_finite=False)
+    L, failed = dpotrf(S, lower=1)
+    if failed:
+        raise BsmapError("the filter's innovation covariance is no longer positive definite")
+    whitened = dtrsv(L, innovation, lower=1)
     W = np.zeros((len(state.mean), len(innovation)), order="F")
-    W[: state.size] = solve_triangular(L, cross.T, lower=True, check_finite=False).T
+    W[: state.size] = dtrsm(1.0, L, cross, side=1, lower=1, trans_a=1)
     state.mean[: state.size] += W[: state.size] @ whitened
     state.mean[2] = se2.wrap(state.mean[2])
     P = dsyrk(-1.0, W, beta=1.0, c=state.covariance, lower=1, overwrite_c=1)

@@ -3,9 +3,11 @@
 Censi (2008) for the metric, with a Cauchy loss whose width shrinks from the reach of the search to the noise.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg.lapack import dposv
 from scipy.spatial import cKDTree
 
 from bsmap_cli.core import se2
@@ -105,12 +107,23 @@ def oriented_points(points: ScanPoints, laser_xy: Array, range_sigma: float) -> 
 
 
 class _Pairs(NamedTuple):
-    """Points paired from one pose. xy, normal : (k, 2), of the source in its frame and of the target. offset : (k,)."""
+    """Points paired from one pose, the closer ones within `reach` metres.
+
+    xy : (2, k) of the source, in its frame.  normal : (2, k), offset : (k,), of the lines of the target.
+    distance : (k,) metres between the two.
+    """
 
     pose: Array
+    reach: float
     xy: Array
     normal: Array
     offset: Array
+    distance: Array
+
+    def within(self, reach: float) -> "_Pairs":
+        """The pairs that are closer than `reach`."""
+        near = self.distance < reach
+        return _Pairs(self.pose, reach, self.xy[:, near], self.normal[:, near], self.offset[near], self.distance[near])
 
 
 def match(
@@ -133,46 +146,63 @@ def match(
     for _ in range(iterations):
         if pairs is None or _has_moved(pairs.pose, pose):
             pairs = _pair(source, target, pose, reach)
-            if len(pairs.offset) < 5:
-                return Match(initial, np.zeros((3, 3)), 0.0, 0.0)
-        c, s = np.cos(pose[2]), np.sin(pose[2])
-        nx, ny = pairs.normal.T
-        x, y = (pairs.xy @ np.array([[c, s], [-s, c]])).T
-        e = nx * (x + pose[0]) + ny * (y + pose[1]) - pairs.offset
-        J = np.stack([nx, ny, ny * x - nx * y])
-        width = max(floor, reach / 4)
-        wJ = J / ((1.0 + (e / width) ** 2) * range_sigma**2)
-        information = wJ @ J.T
+        elif reach < pairs.reach:
+            pairs = pairs.within(reach)
+        if len(pairs.offset) < 5:
+            return Match(initial, np.zeros((3, 3)), 0.0, 0.0)
+        moments, e = _moments(pairs, pose, max(floor, reach / 4))
+        information = moments[:3, :3] / range_sigma**2
         away = pose - initial
         away[2] = se2.wrap(away[2])
-        step = np.linalg.solve(information + prior, -(wJ @ e) - prior @ away)
+        step = dposv(information + prior, -moments[:3, 3] / range_sigma**2 - prior @ away)[1]
         pose += step
-        if reach <= LEAST_REACH and abs(step[0]) + abs(step[1]) < 1e-3 and abs(step[2]) < 5e-4:
+        x, y, theta = step.tolist()
+        if reach <= LEAST_REACH and abs(x) + abs(y) < 1e-3 and abs(theta) < 5e-4:
             break
-        if reach > LEAST_REACH:
-            reach, pairs = max(LEAST_REACH, reach * 0.5), None
+        reach = max(LEAST_REACH, reach * 0.5)
     on = np.abs(e) < floor
     pose[2] = se2.wrap(pose[2])
     rms = float(np.sqrt(np.mean(e[on] ** 2))) if on.any() else 0.0
     return Match(pose, information, np.count_nonzero(on) / max(len(source.xy), 1), rms)
 
 
+def _moments(pairs: _Pairs, pose: Array, width: float) -> tuple[Array, Array]:
+    """(4, 4) weighted sums of products of the derivatives by x, y, theta and of the errors; the errors (k,), metres.
+
+    Weights of the Cauchy loss, `width` metres wide.
+    """
+    (nx, ny), turned = pairs.normal, _turn(pose[2]) @ pairs.xy
+    A = np.empty((4, len(pairs.offset)))
+    A[:2] = pairs.normal
+    np.subtract(ny * turned[0], nx * turned[1], out=A[2])
+    A[3] = nx * (turned[0] + pose[0]) + ny * (turned[1] + pose[1]) - pairs.offset
+    return (A / (1.0 + (A[3] / width) ** 2)) @ A.T, A[3]
+
+
+def _turn(theta: float) -> Array:
+    """(2, 2) rotation by theta."""
+    c, s = math.cos(theta), math.sin(theta)
+    return np.array([[c, -s], [s, c]])
+
+
 def _has_moved(before: Array, pose: Array) -> bool:
     """Whether points may have other partners now than where they were paired."""
-    return bool(abs(pose[0] - before[0]) + abs(pose[1] - before[1]) > 0.01 or abs(pose[2] - before[2]) > 0.003)
+    x, y, theta = (pose - before).tolist()
+    return abs(x) + abs(y) > 0.01 or abs(theta) > 0.003
 
 
 def _pair(source: OrientedPoints, target: Target, pose: Array, reach: float) -> _Pairs:
     """Each point of the source, at `pose` (3,), with the nearest of the target that faces its way."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    R = np.array([[c, s], [-s, c]])
+    R = _turn(pose[2]).T
     distance, nearest = nearest_points(target, source.xy @ R + pose[:2], reach)
     hit = np.flatnonzero(distance < reach)
     nearest = nearest[hit]
     normal = target.points.normal[nearest]
-    same = np.einsum("ij,ij->i", source.normal[hit] @ R, normal) > SAME_WAY
-    normal, xy = normal[same], target.points.xy[nearest[same]]
-    return _Pairs(pose.copy(), source.xy[hit[same]], normal, np.einsum("ij,ij->i", xy, normal))
+    facing = source.normal[hit] @ R
+    same = facing[:, 0] * normal[:, 0] + facing[:, 1] * normal[:, 1] > SAME_WAY
+    hit, normal, xy = hit[same], normal[same].T, target.points.xy[nearest[same]].T
+    offset = xy[0] * normal[0] + xy[1] * normal[1]
+    return _Pairs(pose.copy(), reach, source.xy[hit].T, normal, offset, distance[hit])
 
 
 def search(

@@ -35,11 +35,12 @@ def make_cloud(slam_map: SlamMap, params: CloudParams, *, track: Track = silent)
     track("cloud: scans", 0, 1)
     time_ns = scans.time_ns[scan] + np.rint(beam * scans.time_increment * 1e9).astype(np.int64)
     scan_poses = se2.interpolate(trajectory.time_ns, trajectory.poses, scans.time_ns)
-    scan_covariances = _interpolate_covariances(trajectory, scans.time_ns)
+    scan_covariances = _interpolated(trajectory, trajectory.covariances, scans.time_ns)
     poses = se2.interpolate(trajectory.time_ns, trajectory.poses, time_ns)
     ranges, angles = scans.ranges[scan, beam].astype(float), scans.angles[beam]
     points = beam_points(poses, scans.mount, ranges, angles)
     sensor = sensor_covariances(poses, scans.mount, ranges, angles, sigma, params.angle_sigma)
+    modes = trajectory.modes
     pose = pose_covariances(points[:, :2] - poses[:, :2], scan_covariances[scan])
     track("cloud: scans", 1, 1)
     return PointCloud(
@@ -56,6 +57,7 @@ def make_cloud(slam_map: SlamMap, params: CloudParams, *, track: Track = silent)
         angle_increment=scans.angle_increment,
         range_sigma=sigma,
         angle_sigma=params.angle_sigma,
+        scan_pose_modes=None if modes is None else _interpolated(trajectory, modes, scans.time_ns),
     )
 
 
@@ -95,7 +97,8 @@ def pose_covariances(lever: Array, pose_covariance: Array) -> Array:
 def _in_order(trajectory: Trajectory) -> Trajectory:
     """Trajectory by time; logs whose stamps step back list the poses in another order."""
     order = np.argsort(trajectory.time_ns, kind="stable")
-    return Trajectory(trajectory.time_ns[order], trajectory.poses[order], trajectory.covariances[order])
+    modes = None if trajectory.modes is None else trajectory.modes[order]
+    return Trajectory(trajectory.time_ns[order], trajectory.poses[order], trajectory.covariances[order], modes)
 
 
 def _covered(scans: LaserScans, trajectory: Trajectory) -> NDArray[np.bool_]:
@@ -105,9 +108,9 @@ def _covered(scans: LaserScans, trajectory: Trajectory) -> NDArray[np.bool_]:
     return (scans.time_ns >= first) & (scans.time_ns + takes <= last)
 
 
-def _interpolate_covariances(trajectory: Trajectory, at_ns: IntArray) -> Array:
-    """(k, 3, 3) linear between neighbouring poses, whose errors are nearly the same."""
+def _interpolated(trajectory: Trajectory, matrices: Array, at_ns: IntArray) -> Array:
+    """(k, a, b) of matrices (n, a, b) of the poses, linear between neighbours, whose errors are nearly the same."""
     origin = trajectory.time_ns[0]
     t, at = (trajectory.time_ns - origin).astype(float), (at_ns - origin).astype(float)
-    flat = trajectory.covariances.reshape(-1, 9)
-    return np.stack([np.interp(at, t, column) for column in flat.T], axis=1).reshape(-1, 3, 3)
+    columns = [np.interp(at, t, column) for column in matrices.reshape(len(t), -1).T]
+    return np.array(columns).reshape(-1, len(at)).T.reshape(len(at), *matrices.shape[1:])

@@ -78,15 +78,20 @@ class Trajectory:
     """Poses of base_link in map.
 
     time_ns : (n,) int64.  poses : (n, 3) x, y, theta.  covariances : (n, 3, 3), of (x, y, theta) in map, marginal.
+    modes : (n, 3, k) what the poses' errors have in common: that of pose i is modes_i z and one of its own, z ~ N(0, I)
+    being the same for all; so poses i and j have the covariance modes_i modes_j'. None where that is not known.
     """
 
     time_ns: IntArray
     poses: Array
     covariances: Array
+    modes: Array | None = None
 
     def __post_init__(self) -> None:
         n = len(self.time_ns)
         _check(self, time_ns=(n,), poses=(n, 3), covariances=(n, 3, 3))
+        if self.modes is not None:
+            _check(self, modes=(n, 3, None))
 
 
 @dataclass(frozen=True)
@@ -188,6 +193,7 @@ class PointCloud:
     covariances : (n, 6) xx, xy, xz, yy, yz, zz: sensor and pose part together, Eq. (18).
     scan_time_ns : (m,), scan_poses : (m, 3), scan_pose_covariances : (m, 3, 3): base_link at each vertical scan; with
     them the pose part J_x P J_x' of a point's covariance can be told from the sensor part.
+    scan_pose_modes : (m, 3, k), what the errors of these poses have in common, as in Trajectory; or None.
     mount, angle_min, angle_increment : of the vertical laser, as in LaserScans, so that a point's beam can be had back.
     range_sigma, angle_sigma : metres, radians, the sensor noise in `covariances`.
     """
@@ -205,9 +211,12 @@ class PointCloud:
     angle_increment: float
     range_sigma: float
     angle_sigma: float
+    scan_pose_modes: Array | None = None
 
     def __post_init__(self) -> None:
         n, m = len(self.points), len(self.scan_time_ns)
+        if self.scan_pose_modes is not None:
+            _check(self, scan_pose_modes=(m, 3, None))
         _check(self, points=(n, 3), scan_index=(n,), beam_index=(n,), time_ns=(n,), covariances=(n, 6))
         _check(self, scan_time_ns=(m,), scan_poses=(m, 3), scan_pose_covariances=(m, 3, 3), mount=(4, 4))
 
@@ -231,6 +240,8 @@ class PosePart:
 
     covariance : (3, 3) of (x, y, theta) in map; a rotation by theta turns about `centre` (2,), metres in map.
     weight : share of this data set in the surface (1 before merging); the shares of a surface's parts add up to 1.
+    modes : (3, k) of that covariance what the data sets of one trajectory have in common, as in Trajectory; sets a and
+    b of the same `trajectory` have the covariance modes_a modes_b', others none. None where it is not known.
     A point p has the covariance  J C J',  J = [[1, 0, -(p_y - c_y)], [0, 1, p_x - c_x], [0, 0, 0]].
     """
 
@@ -238,9 +249,13 @@ class PosePart:
     centre: Array
     covariance: Array
     weight: float = 1.0
+    modes: Array | None = None
+    trajectory: str = ""
 
     def __post_init__(self) -> None:
         _check(self, centre=(2,), covariance=(3, 3))
+        if self.modes is not None:
+            _check(self, modes=(3, None))
 
 
 @dataclass(frozen=True)

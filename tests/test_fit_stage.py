@@ -82,6 +82,25 @@ def test_pose_part_gives_points_the_covariance_of_their_pose():
     assert np.linalg.eigvalsh(moved.covariance).min() > 0
 
 
+def test_pose_part_keeps_what_poses_have_in_common_and_averages_the_rest():
+    cloud = room_cloud()
+    rng = np.random.default_rng(1)
+    n = len(cloud.scan_poses)
+    poses = np.column_stack([0.1 * np.arange(n), np.zeros(n), np.zeros(n)])
+    shift = np.tile([[0.03, 0.0], [0.0, 0.02], [0.0, 0.0]], (n, 1, 1))
+    own = np.diag([4e-4, 4e-4, 0.0])
+    cloud = replace(cloud, scan_poses=poses, scan_pose_covariances=shift @ shift.swapaxes(1, 2) + own)
+    cloud = replace(cloud, scan_pose_modes=shift)
+    part = pose_part(cloud, Movement("translation", np.arange(19)), "set")
+    np.testing.assert_allclose(part.modes, shift[0])
+    # 1.8 m of way are 6 times the reach of a pose's own error.
+    np.testing.assert_allclose(part.covariance, np.diag([9e-4, 4e-4, 0.0]) + own / 6, atol=1e-12)
+    other = pose_part(cloud, Movement("translation", np.array([20, 21])), "other")
+    assert other.trajectory == part.trajectory
+    changed = replace(cloud, scan_pose_modes=shift + 1e-3 * rng.normal(size=shift.shape))
+    assert pose_part(changed, Movement("translation", np.arange(19)), "set").trajectory != part.trajectory
+
+
 def test_surface_covariance_is_small_and_positive():
     surface = room_surfaces().surfaces[0]
     u, v = np.random.default_rng(1).random((2, 200))

@@ -38,6 +38,7 @@ def cloud(n: int = 200, m: int = 7) -> PointCloud:
         angle_increment=1 / 3,
         range_sigma=0.01,
         angle_sigma=0.0005,
+        scan_pose_modes=rng.normal(size=(m, 3, 5)),
     )
 
 
@@ -49,6 +50,14 @@ def test_cloud_comes_back_to_the_last_bit(tmp_path: Path, n: int) -> None:
     for name, value in vars(made).items():
         np.testing.assert_array_equal(getattr(read, name), value, err_msg=name)
         assert np.asarray(getattr(read, name)).dtype == np.asarray(value).dtype, name
+
+
+@pytest.mark.parametrize("modes", [None, np.zeros((7, 3, 0))])
+def test_unknown_correlation_is_not_none_at_all(tmp_path: Path, modes: np.ndarray | None) -> None:
+    write_cloud(tmp_path / "a.cloud.ply", replace(cloud(), scan_pose_modes=modes))
+    read = read_cloud(tmp_path / "a.cloud.ply").scan_pose_modes
+    np.testing.assert_array_equal(read, modes)
+    assert np.shape(read) == np.shape(modes)
 
 
 def test_same_cloud_same_bytes_and_long_provenance_in_short_lines(tmp_path: Path) -> None:
@@ -122,8 +131,8 @@ def test_other_version_or_missing_property_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     write_cloud(path, cloud())
     content = path.read_bytes()
-    path.write_bytes(content.replace(b'{"version":1,', b'{"version":9,'))
-    with pytest.raises(BadInputError, match="is of version 9, this bsmap reads 1"):
+    path.write_bytes(content.replace(b'{"version":2,', b'{"version":9,'))
+    with pytest.raises(BadInputError, match="is of version 9, this bsmap reads 2"):
         read_cloud(path)
     path.write_bytes(content.replace(b"property double theta", b"property double thetb"))
     with pytest.raises(BadInputError, match=r"is damaged \(.*theta"):

@@ -31,7 +31,7 @@ def slam_map(n: int = 25, m: int = 6, beams: int = 40) -> SlamMap:
     mount = np.array([[1.0, 0, 0, 0.1], [0, 0, -1, 0], [0, 1, 0, 1 / 3], [0, 0, 0, 1]])
     counts = rng.integers(0, 20, (4, n))
     return SlamMap(
-        Trajectory(times, rng.normal(size=(n, 3)) * 5, symmetric(rng, n, 3)),
+        Trajectory(times, rng.normal(size=(n, 3)) * 5, symmetric(rng, n, 3), rng.normal(size=(n, 3, 4))),
         LineMap(
             rng.uniform(0, 3, (m, 2)), symmetric(rng, m, 2), np.sort(rng.normal(size=(m, 2))),
             rng.choice([-1, 1], m), rng.integers(1, 99, m),
@@ -98,7 +98,7 @@ def test_viewers_find_standard_messages(tmp_path: Path) -> None:
     counts = {topic: len(values) for topic, values in messages.items()}
     assert counts == {
         "/tf_static": 1, "/bsmap/slam": 1, "/map/segments": 1, "/map/closures": 1,
-        "/trajectory": 1, "/trajectory_tracked": 1, "/bsmap/tracked": 1,
+        "/trajectory": 1, "/trajectory_tracked": 1, "/bsmap/tracked": 1, "/bsmap/modes": 1,
         "/pose": 25, "/tf": 25, "/bsmap/steps": 25, "/scan_vertical": 24,
     }  # fmt: skip
     assert {t.child_frame_id for t in messages["/tf_static"][0].transforms} == {"laser_horizontal", "laser_vertical"}
@@ -162,5 +162,5 @@ def test_a_log_is_not_a_slam_map(tmp_path: Path) -> None:
 def test_another_version_is_refused(tmp_path: Path) -> None:
     with ros_writer(tmp_path / "a.mcap") as writer:
         writer.write("/bsmap/slam", ros.make("std_msgs/msg/String", data='{"format":"bsmap-slam","version":99}'), 0)
-    with pytest.raises(BadInputError, match="is of version 99, this bsmap reads 2"):
+    with pytest.raises(BadInputError, match="is of version 99, this bsmap reads 3"):
         read_slam(tmp_path / "a.mcap")

@@ -69,6 +69,27 @@ def test_long_chain_is_interpolated_between_poses_that_are_exact():
     np.testing.assert_allclose(found.poses, expected, rtol=1e-6, atol=1e-12)
 
 
+def test_modes_are_what_the_errors_of_all_poses_have_in_common():
+    """A common shift of all poses but the first, and noise of their own: one mode, the same for all."""
+    n, common, own = 40, np.array([0.05, 0.03, 0.01]), np.array([0.002, 0.002, 0.001])
+    ones = np.ones((n - 1, n - 1))
+    joint = np.kron(ones, np.diag(common**2)) + np.kron(np.eye(n - 1), np.diag(own**2))
+    found = marginals(sparse.csc_matrix(np.linalg.inv(joint)), n, 0).modes
+    np.testing.assert_array_equal(found[0], 0.0)
+    assert found.shape == (n, 3, 3)
+    for a, b in [(1, 1), (1, 20), (39, 5)]:
+        np.testing.assert_allclose(found[a] @ found[b].T, np.diag(common**2), rtol=0.05, atol=1e-9)
+
+
+def test_modes_hold_no_more_than_the_covariance():
+    information = graph(60, 20)
+    found = marginals(sparse.csc_matrix(information), 60, 20)
+    assert 0 < found.modes.shape[2] <= 12
+    joint = np.linalg.inv(information)[: 3 * 59, : 3 * 59]
+    L = found.modes[1:].reshape(3 * 59, -1)
+    assert np.linalg.eigvalsh(joint - L @ L.T).min() > -1e-9
+
+
 def test_what_nothing_observes_has_no_covariance():
     information = graph(5, 1)
     information[-2:, :] = information[:, -2:] = 0.0

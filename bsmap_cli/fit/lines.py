@@ -1,5 +1,6 @@
 """Scan lines of a data set: the points of its scans in the order of the beams, with the sensor's covariance."""
 
+import hashlib
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +10,8 @@ from bsmap_cli.core.gaussian import pack
 from bsmap_cli.fit.movement import Movement
 from bsmap_cli.model import Array, IntArray, PointCloud, PosePart
 
+OWN_REACH = (0.3, 0.3)
+"""Metres and radians over which a pose's own error stays the same: slam interpolates between key scans so far apart."""
 LEAST_SHARE = 0.5
 """Of the median number of points of a data set's scans, that a scan must have."""
 
@@ -71,14 +74,29 @@ def _turn(theta: Array, vectors: Array) -> Array:
 
 
 def pose_part(cloud: PointCloud, movement: Movement, name: str) -> PosePart:
-    """Error of pose common to a data set: mean of the scans' covariances, each turned about the mean position.
+    """Error of pose common to a data set: the mean of its scans' errors, each turned about the mean position.
 
-    An approximation: the poses of a set are taken to err together. What they err apart is left to the residuals.
+    Of these the modes are known to all scans; what a pose errs by on its own is taken to be one over OWN_REACH, so that
+    the mean over a longer way has a share of it. Where nothing is known of modes, all poses are taken to err together.
     """
     poses, covariances = cloud.scan_poses[movement.scans], cloud.scan_pose_covariances[movement.scans]
     centre = poses[:, :2].mean(axis=0)
     J = np.tile(np.eye(3), (len(poses), 1, 1))
     J[:, 0, 2] = poses[:, 1] - centre[1]
     J[:, 1, 2] = centre[0] - poses[:, 0]
-    about_centre = (J @ covariances @ np.swapaxes(J, 1, 2)).mean(axis=0)
-    return PosePart(name, centre, (about_centre + about_centre.T) / 2)
+    whole = (J @ covariances @ np.swapaxes(J, 1, 2)).mean(axis=0)
+    if cloud.scan_pose_modes is None:
+        return PosePart(name, centre, (whole + whole.T) / 2)
+    of_scans = J @ cloud.scan_pose_modes[movement.scans]
+    own = whole - (of_scans @ np.swapaxes(of_scans, 1, 2)).mean(axis=0)
+    modes = of_scans.mean(axis=0)
+    covariance = modes @ modes.T + own / _independent(poses)
+    trajectory = hashlib.sha256(cloud.scan_pose_modes.tobytes()).hexdigest()[:8]
+    return PosePart(name, centre, (covariance + covariance.T) / 2, modes=modes, trajectory=trajectory)
+
+
+def _independent(poses: Array) -> float:
+    """How many poses (n, 3) err on their own, by the way and the turns between them."""
+    steps = se2.between(poses[:-1], poses[1:])
+    way = np.hypot(steps[:, 0], steps[:, 1]).sum() / OWN_REACH[0], np.abs(steps[:, 2]).sum() / OWN_REACH[1]
+    return float(np.clip(max(way), 1.0, len(poses)))

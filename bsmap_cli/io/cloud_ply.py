@@ -6,9 +6,11 @@
                     double cov_xx .. cov_zz         six terms of the point's covariance, metres squared
     element scan    double time x y theta           pose of base_link at each vertical scan
                     double cov_xx cov_xy cov_xt cov_yy cov_yt cov_tt
+                    double mode1_x mode1_y mode1_t ..  what the poses' errors have in common, see `Trajectory`
 
 Comments hold one JSON object each, broken where longer than other readers take: `bsmap-provenance:`, and
-`bsmap-cloud:` with format version, `epoch_ns` (int), mount (4 x 4, T_base_laser), angles and noise of the laser.
+`bsmap-cloud:` with format version, `epoch_ns` (int), mount (4 x 4, T_base_laser), angles and noise of the laser,
+`modes` (int, or null where it is not known what the errors have in common).
 """
 
 import json
@@ -25,7 +27,7 @@ from bsmap_cli.io.artifact import Provenance, atomic_output, join_comments, spli
 from bsmap_cli.io.completeness import ply_size
 from bsmap_cli.model import Array, IntArray, PointCloud
 
-VERSION = 1
+VERSION = 2
 _POINT = ("xx", "xy", "xz", "yy", "yz", "zz")
 _POSE = ("xx", "xy", "xt", "yy", "yt", "tt")
 VERTEX = [
@@ -44,6 +46,7 @@ def write_cloud(path: Path | str, cloud: PointCloud, provenance: Provenance | No
     epoch = int(np.min(np.concatenate([cloud.scan_time_ns, cloud.time_ns]), initial=2**63 - 1))
     facts = {"version": VERSION, "frame": "map", "epoch_ns": epoch, "mount": cloud.mount.tolist()}
     facts |= {name: float(getattr(cloud, name)) for name in _LASER_FIELDS}
+    facts["modes"] = None if cloud.scan_pose_modes is None else cloud.scan_pose_modes.shape[2]
     comments = [*split_comment(provenance.to_line())] if provenance else []
     comments += split_comment("bsmap-cloud:" + json.dumps(facts, separators=(",", ":")))
     elements = [
@@ -65,13 +68,24 @@ def _vertices(cloud: PointCloud, epoch: int) -> NDArray[Any]:
 
 
 def _scans(cloud: PointCloud, epoch: int) -> NDArray[Any]:
-    rows = np.zeros(len(cloud.scan_time_ns), dtype=SCAN)
+    modes = np.zeros((len(cloud.scan_time_ns), 3, 0)) if cloud.scan_pose_modes is None else cloud.scan_pose_modes
+    rows = np.zeros(len(modes), dtype=_scan_type(modes.shape[2]))
     rows["time"] = _seconds(cloud.scan_time_ns, epoch)
     for k, name in enumerate(("x", "y", "theta")):
         rows[name] = cloud.scan_poses[:, k]
     for pair, i, j in zip(_POSE, *_UPPER, strict=True):
         rows[f"cov_{pair}"] = cloud.scan_pose_covariances[:, i, j]
+    for name, column in zip(_mode_names(modes.shape[2]), modes.swapaxes(1, 2).reshape(len(modes), -1).T, strict=True):
+        rows[name] = column
     return rows
+
+
+def _mode_names(modes: int) -> list[str]:
+    return [f"mode{number}_{axis}" for number in range(1, modes + 1) for axis in "xyt"]
+
+
+def _scan_type(modes: int) -> list[tuple[str, str]]:
+    return [*SCAN, *((name, "<f8") for name in _mode_names(modes))]
 
 
 def _seconds(time_ns: IntArray, epoch: int) -> Array:
@@ -93,7 +107,8 @@ def read_cloud(path: Path | str) -> PointCloud:
     try:
         elements = PlyData.read(str(path))
         vertex, scan = elements["vertex"].data, elements["scan"].data
-        vertex, scan = vertex[[name for name, _ in VERTEX]], scan[[name for name, _ in SCAN]]
+        vertex = vertex[[name for name, _ in VERTEX]]
+        scan = scan[[name for name, _ in _scan_type(facts["modes"] or 0)]]
     except (PlyParseError, KeyError, ValueError) as error:
         raise BadInputError(f"{path}: is damaged ({error}); run `bsmap cloud` again") from error
     _check_values(path, vertex, scan)
@@ -110,8 +125,15 @@ def read_cloud(path: Path | str) -> PointCloud:
         scan_poses=np.column_stack([scan[name] for name in ("x", "y", "theta")]),
         scan_pose_covariances=covariances,
         mount=np.array(facts["mount"], dtype=float),
+        scan_pose_modes=None if facts["modes"] is None else _modes(scan, facts["modes"]),
         **{name: facts[name] for name in _LASER_FIELDS},
     )
+
+
+def _modes(scan: NDArray[Any], modes: int) -> Array:
+    """(m, 3, k)"""
+    columns = np.array([scan[name] for name in _mode_names(modes)]).reshape(modes, 3, len(scan))
+    return columns.transpose(2, 1, 0)
 
 
 def _nanoseconds(seconds: Array, epoch: int) -> IntArray:

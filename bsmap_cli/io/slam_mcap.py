@@ -9,6 +9,7 @@
 | /trajectory | nav_msgs/Path | all poses |
 | /trajectory_tracked | nav_msgs/Path | all poses before loops were closed |
 | /bsmap/tracked | std_msgs/Float64MultiArray | the same poses, x, y, theta |
+| /bsmap/modes | std_msgs/Float64MultiArray | what the poses' errors have in common, see `Trajectory`; where known |
 | /pose | geometry_msgs/PoseWithCovarianceStamped | pose of base_link in map and its covariance, one a horizontal scan |
 | /tf | tf2_msgs/TFMessage | map -> base_link, the same poses |
 | /bsmap/steps | std_msgs/Float64MultiArray | theta, new, stored, matched, nis, dof of each step |
@@ -42,7 +43,7 @@ from bsmap_cli.model import (
     segment_ends,
 )
 
-VERSION = 2
+VERSION = 3
 STEP_COLUMNS = "theta new stored matched nis dof"
 _READ = (ros.STRING, ros.NUMBERS, ros.POSE_WITH_COVARIANCE, ros.LASER_SCAN)
 SEGMENT_COLOR, HELD_COLOR, REFUSED_COLOR = (0.1, 0.5, 1.0), (0.1, 0.8, 0.2), (0.9, 0.2, 0.1)
@@ -104,6 +105,8 @@ def _map_messages(slam: SlamMap, start: int) -> Iterator[tuple[str, Any]]:
     if slam.tracked_poses is not None:
         yield "/trajectory_tracked", _path(slam.trajectory.time_ns, slam.tracked_poses, start)
         yield "/bsmap/tracked", ros.numbers_message(slam.tracked_poses, "x y theta")
+    if slam.trajectory.modes is not None:
+        yield "/bsmap/modes", ros.numbers_message(slam.trajectory.modes, "modes of x, y, theta")
 
 
 def _header(slam: SlamMap) -> dict[str, Any]:
@@ -177,7 +180,7 @@ def read_slam(path: Path | str) -> SlamMap:
     numbers = np.array([step.data for step in steps], dtype=float).reshape(-1, len(STEP_COLUMNS.split()))
     vertical = header["vertical"]
     return SlamMap(
-        trajectory=_trajectory(poses, numbers[:, 0]),
+        trajectory=_trajectory(poses, numbers[:, 0], messages.get("/bsmap/modes", [])),
         lines=_lines(header["lines"]),
         statistics=_statistics(numbers),
         vertical=vertical and _laser(vertical, messages.get(vertical["topic"], [])),
@@ -199,13 +202,14 @@ def _checked_header(path: Path | str, messages: dict[str, list[Any]]) -> dict[st
     return header
 
 
-def _trajectory(poses: list[Any], theta: Array) -> Trajectory:
+def _trajectory(poses: list[Any], theta: Array, modes: list[Any]) -> Trajectory:
     points = [(message.pose.pose.position.x, message.pose.pose.position.y) for message in poses]
     covariances = [message.pose.covariance.reshape(6, 6)[ros.PLANAR] for message in poses]
     return Trajectory(
         time_ns=np.array([ros.time_of(message) for message in poses], dtype=np.int64),
         poses=np.column_stack([np.array(points).reshape(-1, 2), theta]),
         covariances=np.array(covariances).reshape(-1, 3, 3),
+        modes=np.array(modes[0].data, dtype=float).reshape(len(poses), 3, -1) if modes else None,
     )
 
 

@@ -88,8 +88,8 @@ def _unexplained(log: ScanLog, tracking: Tracking, closures: Closures, segments:
     return concatenate([matches, closures.closures])
 
 
-def _every_scan(tracking: Tracking, poses: Array, known: Marginals) -> tuple[Array, Array]:
-    """Poses (n, 3) and covariances (n, 3, 3) of all scans from those of the key scans.
+def _every_scan(tracking: Tracking, poses: Array, known: Marginals) -> tuple[Array, Array, Array]:
+    """Poses (n, 3), covariances (n, 3, 3) and modes (n, 3, k) of all scans from those of the key scans.
 
     Between two key scans the tracked motion is kept; what it misses of the way to the second one is spread over it. So
     the error is a share of either key scan's, which are correlated, and of the match's own.
@@ -110,7 +110,7 @@ def _every_scan(tracking: Tracking, poses: Array, known: Marginals) -> tuple[Arr
     spread = first**2 * known.poses[before] + second**2 * known.poses[after] + first * second * cross
     between = (share[:, 0] > 0) & (share[:, 0] < 1)
     spread[between] += _match_covariances(tracking, every[between, 2], before[between])
-    return every, spread
+    return every, spread, first * known.modes[before] + second * known.modes[after]
 
 
 def _match_covariances(tracking: Tracking, heading: Array, key: IntArray) -> Array:

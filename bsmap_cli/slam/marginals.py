@@ -1,9 +1,11 @@
 """Marginal covariances out of the smoothed information matrix, by solving for the columns that are asked for."""
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
+from scipy.linalg import eigh
 from scipy.sparse.linalg import SuperLU
 
 from bsmap_cli.model import Array, IntArray
@@ -13,54 +15,99 @@ MOST_POSES = 300
 """Poses solved for exactly; those between them are interpolated, for neighbours err alike."""
 COLUMNS = 120
 """Columns solved for at once."""
+MOST_MODES = 12
+LEAST_SHARE = 0.01
+"""Modes of the poses' errors that are told: at most so many, each with at least this share of the sum of variances."""
+LEVER = 3.0
+"""Metres at which an error of heading counts as one of position, for the choice of modes: where points are seen."""
 
 
 class Marginals(NamedTuple):
     """poses : (n, 3, 3), of key poses in map, the first one 0.  lines : (m, 2, 2), of alpha, r.
 
     following : (n, 3, 3), covariance of each key pose (rows) with the next one (columns); 0 for the last.
+    modes : (n, 3, k), what the poses' errors have in common, as in `Trajectory`.
     """
 
     poses: Array
     following: Array
     lines: Array
+    modes: Array
 
 
 def marginals(information: sparse.csc_matrix, poses: int, lines: int) -> Marginals:
     """Covariances of `poses` key poses and `lines` lines; the information is of all but the first pose."""
-    at = np.unique(np.linspace(1, poses - 1, min(poses - 1, MOST_POSES)).astype(int)) if poses > 1 else np.zeros(0, int)
     if information.shape[0] == 0:
-        return Marginals(np.zeros((poses, 3, 3)), np.zeros((poses, 3, 3)), np.zeros((lines, 2, 2)))
+        none = np.zeros((poses, 3, 3))
+        return Marginals(none, none, np.zeros((lines, 2, 2)), none[..., :0])
+    at = np.unique(np.linspace(1, poses - 1, min(poses - 1, MOST_POSES)).astype(int)) if poses > 1 else np.zeros(0, int)
     factors = factorise(information)
-    known, none = np.concatenate([[0], at]), np.zeros((1, 3, 3))
-    starts = 3 * (at - 1)
-    # The last pose has none after it: its own column stands there until it is set to 0.
-    after = np.minimum(starts + 3, 3 * (poses - 2))
-    exact = _blocks(factors, starts, np.stack([starts, after]), 3)
-    every, following = (_between(known, np.concatenate([none, blocks]), poses) for blocks in exact)
-    own = (every + np.swapaxes(every, 1, 2)) / 2
-    following[-1] = 0.0
+    known = np.concatenate([[0], at])
+    own, following, joint = _of_poses(factors, 3 * (at - 1), 3 * (poses - 2))
+    every, after, modes = (_between(known, _with_first(part), poses) for part in (own, following, _modes(joint)))
+    after[-1] = 0.0
     first_line = 3 * (poses - 1) + 2 * np.arange(lines)
-    (of_lines,) = _blocks(factors, first_line, first_line[None], 2)
-    return Marginals(own, following, (of_lines + np.swapaxes(of_lines, 1, 2)) / 2)
+    blocks = [_block(solved, first_line[some]) for some, solved in _solved(factors, first_line, 2)]
+    of_lines = np.concatenate([np.zeros((0, 2, 2)), *blocks])
+    return Marginals(_symmetric(every), after, _symmetric(of_lines), modes)
+
+
+def _with_first(blocks: Array) -> Array:
+    """The blocks (k, ...) after that of the first pose, which does not err."""
+    return np.concatenate([np.zeros((1, *blocks.shape[1:])), blocks])
+
+
+def _symmetric(blocks: Array) -> Array:
+    return (blocks + np.swapaxes(blocks, 1, 2)) / 2
 
 
 def _between(known: IntArray, blocks: Array, count: int) -> Array:
-    """Blocks (count, a, a) of all from those (k, a, a) of some, linear between neighbours."""
+    """Blocks (count, a, b) of all from those (k, a, b) of some, linear between neighbours."""
     columns = [np.interp(np.arange(count), known, column) for column in blocks.reshape(len(known), -1).T]
-    return np.stack(columns, axis=-1).reshape(count, *blocks.shape[1:])
+    return np.array(columns).reshape(-1, count).T.reshape(count, *blocks.shape[1:])
 
 
-def _blocks(factors: SuperLU, starts: IntArray, columns: IntArray, size: int) -> Array:
-    """Blocks (a, k, size, size) of the inverse, whose rows begin at `starts` (k,) and columns at `columns` (a, k)."""
-    out = np.empty((*columns.shape, size, size))
+def _of_poses(factors: SuperLU, starts: IntArray, last: int) -> tuple[Array, Array, Array]:
+    """Blocks (k, 3, 3) of poses that begin at `starts` (k,), those with the next pose, and all of them (3 k, 3 k).
+
+    last : beginning of the last pose, which has none after it: its own block stands there.
+    """
+    k = len(starts)
+    own, following, joint = np.empty((k, 3, 3)), np.empty((k, 3, 3)), np.empty((k, 3, k, 3))
+    for some, solved in _solved(factors, starts, 3):
+        joint[:, :, some] = solved[starts[:, None] + np.arange(3)]
+        own[some] = _block(solved, starts[some])
+        following[some] = _block(solved, np.minimum(starts[some] + 3, last))
+    return own, following, joint.reshape(3 * k, 3 * k)
+
+
+def _block(solved: Array, rows: IntArray) -> Array:
+    """Blocks (j, size, size) of columns (n, j, size), each in the rows that begin at `rows` (j,)."""
+    axes = np.arange(solved.shape[2])
+    return np.asarray(solved[rows[:, None, None] + axes, np.arange(len(rows))[:, None, None], axes[:, None]])
+
+
+def _solved(factors: SuperLU, starts: IntArray, size: int) -> Iterator[tuple[slice, Array]]:
+    """Columns (n, j, size) of the inverse that begin at `starts` (k,), some at a time."""
     at_once = COLUMNS // size
     for first in range(0, len(starts), at_once):
-        rows = starts[first : first + at_once, None] + np.arange(size)
+        some = slice(first, min(first + at_once, len(starts)))
+        rows = starts[some, None] + np.arange(size)
         side = np.zeros((factors.shape[0], rows.size))
         side[rows.ravel(), np.arange(rows.size)] = 1.0
-        solved = factors.solve(side).reshape(-1, *rows.shape)
-        at = columns[:, first : first + at_once, None, None] + np.arange(size)
-        k = np.arange(len(rows))[:, None, None]
-        out[:, first : first + len(rows)] = solved[at, k, np.arange(size)[:, None]]
-    return out
+        yield some, factors.solve(side).reshape(-1, *rows.shape)
+
+
+def _modes(joint: Array) -> Array:
+    """(k, 3, modes) of the largest principal components of the poses' errors, from their covariance (3 k, 3 k)."""
+    k = len(joint) // 3
+    if k == 0:
+        return np.zeros((0, 3, 0))
+    scale = np.tile([1.0, 1.0, LEVER], k)
+    largest = [max(3 * k - MOST_MODES, 0), 3 * k - 1]
+    values, vectors = eigh((joint + joint.T) / 2 * scale * scale[:, None], subset_by_index=largest)
+    kept = np.flatnonzero(values > LEAST_SHARE * max(joint.diagonal() @ scale**2, 1e-300))[::-1]
+    vectors = vectors[:, kept] * np.sqrt(values[kept])
+    # An eigenvector's sign is free: its largest entry is made positive, so that it is the same everywhere.
+    vectors *= np.sign(vectors[np.argmax(np.abs(vectors), axis=0), np.arange(len(kept))])
+    return (vectors / scale[:, None]).reshape(k, 3, len(kept))

@@ -182,15 +182,19 @@ def _through(
     row, column = np.nonzero(same & grid.hit[:-1, own] & grid.hit[1:, other])
     column += own.start
     met = _corners(labels, crossings)
-    here, there = grid.points[row, column], grid.points[row + 1, column + step]
     for side in (0, 1):
-        first, second = (_End(grid, fields, ends, side, row + k, column + k * step) for k in (0, 1))
+        faces = ends.face[side, row, column], ends.face[side, row + 1, column + step]
+        # Two runs that end at the same face say nothing of what is between them, nor do two that end openly.
+        differ = faces[0] != faces[1]
+        r, c = row[differ], column[differ]
+        first, second = (_End(grid, fields, ends, side, r + k, c + k * step) for k in (0, 1))
+        here, there = grid.points[r, c], grid.points[r + 1, c + step]
         a0, a1, b0, b1 = first.beyond(here), first.beyond(there), second.beyond(here), second.beyond(there)
-        corner = met[row, first.face, second.face]
+        corner = met[r, first.face, second.face]
         wrong = ((first.face >= 0) & (a1 > THROUGH)) | ((second.face >= 0) & (b0 > THROUGH))
         # The way from one beam to the other leaves the first's side before it comes to the second's.
         leaves = (a1 > THROUGH) & (b0 > THROUGH) & (_zero(a0, a1) < _zero(b0, b1))
-        bad[row, column] |= np.where(corner, leaves, wrong)
+        bad[r, c] |= np.where(corner, leaves, wrong)
     return bad
 
 

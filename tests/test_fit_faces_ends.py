@@ -12,6 +12,7 @@ from bsmap_cli.fit.division import find_faces
 from bsmap_cli.fit.ends import doubtful_cells, find_ends, on_faces, within_ends
 from bsmap_cli.fit.faces import fit_set
 from bsmap_cli.fit.heights import offset
+from bsmap_cli.fit.labels import feet_of_faces
 from bsmap_cli.model import SurfaceMap
 from bsmap_cli.simulate.geometry import carve, room, solid
 
@@ -75,7 +76,7 @@ def corner():
     faces = find_faces(grid)
     fields = [fitted.field for fitted in faces.fitted]
     crossings = find_crossings(grid, faces.labels, fields)
-    grid = on_faces(grid, faces.labels, fields)
+    grid = on_faces(grid, faces.labels, feet_of_faces(grid, faces.labels, fields))
     return grid, faces.labels, fields, crossings, find_ends(grid, faces.labels, crossings)
 
 

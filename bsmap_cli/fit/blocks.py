@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.model import Array, IntArray
@@ -29,9 +30,10 @@ class Blocks(NamedTuple):
     column: Array
     owner: IntArray
 
-    def pick(self, keep: Array) -> "Blocks":
+    def pick(self, keep: IntArray | NDArray[np.bool_]) -> "Blocks":
         """The blocks that an index or a mask (k,) names."""
-        return Blocks(*(field[keep] for field in self))
+        points, directions, counts, row, column, owner = self
+        return Blocks(points[keep], directions[keep], counts[keep], row[keep], column[keep], owner[keep])
 
 
 def make_blocks(grid: BeamGrid, row: IntArray, start: IntArray, stop: IntArray) -> Blocks:

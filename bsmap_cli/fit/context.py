@@ -6,7 +6,7 @@ import numpy as np
 
 from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.blocks import Blocks, make_blocks
-from bsmap_cli.fit.lowmodels import Sums, chi_square
+from bsmap_cli.fit.lowmodels import Sums, chi_squares
 from bsmap_cli.fit.pieces import Pieces
 from bsmap_cli.model import Array, IntArray
 
@@ -53,11 +53,9 @@ def make_context(grid: BeamGrid, pieces: Pieces) -> Context:
     blocks = make_blocks(grid, pieces.row, pieces.start, pieces.stop)
     first = np.searchsorted(blocks.owner, np.arange(len(pieces.row) + 1))
     price = PRICE * np.where(pieces.curved, 3.0, 2.0)
-    chi, count = np.zeros(len(pieces.row)), np.zeros(len(pieces.row))
     size = np.where(pieces.curved, 3, 2)
-    for k in range(len(pieces.row)):
-        part = blocks.pick(np.arange(first[k], first[k + 1]))
-        chi[k], count[k] = _own_chi(part, int(size[k]), grid.sigma), part.counts.sum()
+    chi = _own_chi(blocks, size, grid.sigma)
+    count = np.bincount(blocks.owner, blocks.counts, len(pieces.row)).astype(np.float64)
     inflation = _inflation(chi, np.diff(first) - size)
     return Context(
         pieces, blocks, first, chi / inflation, price, count, _neighbours(pieces), grid.sigma * np.sqrt(inflation)
@@ -75,21 +73,30 @@ def _inflation(chi: Array, freedom: IntArray) -> float:
     return float(max(1.0, ratio[order][half]))
 
 
-def _own_chi(part: Blocks, size: int, sigma: float) -> float:
-    """Chi square of a piece's blocks about its own line, in w = 1/range over the angle to the middle beam."""
-    if len(part.counts) <= size:
-        return 0.0
-    origin = part.points.mean(axis=0)
-    chord = part.points[-1] - part.points[0]
-    chord = chord / np.linalg.norm(chord)
-    along = (part.points - origin) @ chord
-    normal = np.cross(np.cross(chord, part.directions.mean(axis=0)), chord)
-    normal /= np.linalg.norm(normal)
-    height = (part.points - origin) @ normal
-    root = np.sqrt(part.counts) / sigma / np.maximum(np.abs(part.directions @ normal), 0.05)
-    N = np.vander(along, size, increasing=True) * root[:, None]
-    x = np.linalg.lstsq(N, height * root, rcond=1e-10)[0]
-    return float(np.sum((N @ x - height * root) ** 2))
+def _own_chi(blocks: Blocks, size: IntArray, sigma: float) -> Array:
+    """Chi square (k,) of the blocks of each piece about its own line (`size` 2) or parabola (3), over its chord."""
+    number = np.bincount(blocks.owner, minlength=len(size))
+    known = np.flatnonzero(number > size)
+    out = np.zeros(len(size))
+    if not len(known):
+        return out
+    part = blocks.pick(np.flatnonzero((number > size)[blocks.owner]))
+    first = np.concatenate([[0], np.cumsum(number[known])])
+    of = np.repeat(np.arange(len(known)), number[known])
+    mean = np.add.reduceat(np.column_stack([part.points, part.directions]), first[:-1]) / number[known, None]
+    chord = part.points[first[1:] - 1] - part.points[first[:-1]]
+    chord /= np.linalg.norm(chord, axis=1, keepdims=True)
+    normal = np.cross(np.cross(chord, mean[:, 3:]), chord)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    centred = part.points - mean[of, :3]
+    along, height = np.sum(centred * chord[of], axis=1), np.sum(centred * normal[of], axis=1)
+    root = np.sqrt(part.counts) / sigma / np.maximum(np.abs(np.sum(part.directions * normal[of], axis=1)), 0.05)
+    N = np.stack([root, root * along, np.where(size[known][of] == 3, root * along**2, 0.0)], axis=1)
+    A = np.add.reduceat(N[:, :, None] * N[:, None, :], first[:-1])
+    A[size[known] == 2, 2, 2] = 1.0
+    x = np.linalg.solve(A, np.add.reduceat(N * (height * root)[:, None], first[:-1])[:, :, None])[:, :, 0]
+    out[known] = np.add.reduceat((np.sum(N * x[of], axis=1) - height * root) ** 2, first[:-1])
+    return out
 
 
 def _neighbours(pieces: Pieces) -> list[list[int]]:
@@ -113,4 +120,4 @@ def _neighbours(pieces: Pieces) -> list[list[int]]:
 def joint_excess(context: Context, members: list[int], sums: Sums, size: int) -> float:
     """By how much a joint surface is worse than the pieces apart, prices and slack included; negative: better."""
     apart = sum(context.chi[k] + context.price[k] + context.slack * context.beams[k] for k in members)
-    return chi_square(sums, size) + PRICE * size - float(apart)
+    return float(chi_squares(sums, (size,))[0]) + PRICE * size - float(apart)

@@ -1,7 +1,5 @@
 """Outlines of what scattered points cover: triangles between neighbours, as far as the points' own spacing reaches."""
 
-from collections import defaultdict
-
 import numpy as np
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
@@ -63,10 +61,7 @@ def _loops(triangles: IntArray) -> list[list[int]]:
     sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     size = int(triangles.max(initial=0)) + 1
     there, back = sides[:, 0] * size + sides[:, 1], sides[:, 1] * size + sides[:, 0]
-    edges: dict[tuple[int, int], int] = defaultdict(int)
-    for start, end in sides[~np.isin(there, back)].tolist():
-        edges[start, end] += 1
-    return chain(edges)
+    return chain(sides[~np.isin(there, back)])
 
 
 def _simplified(loop: Array, tolerance: float) -> Array:

@@ -11,6 +11,8 @@ from bsmap_cli.fit.heights import HeightField, offset
 from bsmap_cli.model import Array, IntArray
 
 STEPS = 8
+EXACT = 1e-9
+"""Metres; a step of Newton's method below this is the last one."""
 SETTLED = 2e-4
 """Metres to both surfaces within which a point is on them."""
 SHARE = 0.05
@@ -95,6 +97,8 @@ def _meet(
         step = np.where(crossing[:, None], np.linalg.solve(J, right[:, :, None])[:, :, 0], 0.0)
         length = np.maximum(np.linalg.norm(step, axis=1), 1e-12)
         points = points - step * np.minimum(1.0, reach / length)[:, None]
+        if length.max(initial=0.0) < EXACT:
+            break
     values, _ = _offsets(fields, pair, points)
     settled = crossing & (np.max(np.abs(values), axis=0) < SETTLED)
     lengths = np.linalg.norm(points - p0, axis=1) + np.linalg.norm(points - p1, axis=1)

@@ -1,5 +1,6 @@
 """Faces of a data set: beams divided into smooth surfaces, each fitted as a height field over its own base."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -80,9 +81,9 @@ def _widened(grid: BeamGrid, labels: IntArray, fitted: list[Fitted], sigma: floa
         high = np.minimum(np.vstack([at, field.high]).max(axis=0), field.high + FARTHEST)
         if np.any(low < field.low) or np.any(high > field.high):
             margin = 0.02 * (high - low)
-            field = field._replace(
-                low=np.where(low < field.low, low - margin, low), high=np.where(high > field.high, high + margin, high)
-            )
+            low = np.where(low < field.low, low - margin, low)
+            high = np.where(high > field.high, high + margin, high)
+            field = replace(field, low=low, high=high)
             old = refit(field, blocks, sigma)
         out.append(old)
     return out
@@ -144,10 +145,11 @@ def choose_base(blocks: Blocks, sigma: float) -> Base:
 
 def _rectangle(grid: BeamGrid, member: NDArray[np.bool_], base: Base) -> tuple[Array, Array]:
     """Corners (2,) in s and t of the rectangle around a face's beams, with room for a cell of the grid beyond them."""
-    st = np.full((*grid.hit.shape, 2), np.nan)
-    inside = member & grid.hit
-    st[inside] = base.local(grid.points[inside])[:, :2]
-    low, high = np.nanmin(st, axis=(0, 1)), np.nanmax(st, axis=(0, 1))
+    row, column = np.nonzero(member & grid.hit)
+    at = base.local(grid.points[row, column])[:, :2]
+    low, high = at.min(axis=0), at.max(axis=0)
+    st = np.full((int(np.ptp(row)) + 1, int(np.ptp(column)) + 1, 2), np.nan)
+    st[row - row.min(), column - column.min()] = at
     margin = np.full(2, 0.02)
     for axis in (0, 1):
         steps = np.abs(np.diff(st, axis=axis)).reshape(-1, 2)

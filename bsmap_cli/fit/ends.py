@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.crossings import FARTHEST, SETTLED, Crossings
-from bsmap_cli.fit.heights import HeightField, offset
-from bsmap_cli.fit.labels import feet_of, runs_of
+from bsmap_cli.fit.heights import Feet, HeightField, offset
+from bsmap_cli.fit.labels import runs_of
 from bsmap_cli.model import Array, IntArray
 
 BEYOND = 0.002
@@ -57,12 +57,11 @@ def find_ends(grid: BeamGrid, labels: IntArray, crossings: Crossings) -> Ends:
     return Ends(face, last, inner)
 
 
-def on_faces(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField]) -> BeamGrid:
-    """The grid, its points moved along their beams onto their faces: without the noise."""
+def on_faces(grid: BeamGrid, labels: IntArray, feet: Sequence[Feet]) -> BeamGrid:
+    """The grid, its points moved along their beams to their feet on their faces: without the noise."""
     points = grid.points.copy()
-    for number, field in enumerate(fields):
-        mask = (labels == number) & grid.hit
-        points[mask] = feet_of(grid, field, mask).points
+    for number, of_face in enumerate(feet):
+        points[(labels == number) & grid.hit] = of_face.points
     return grid._replace(points=points)
 
 

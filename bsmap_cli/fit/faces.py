@@ -8,7 +8,7 @@ import numpy as np
 from bsmap_cli.errors import BsmapError
 from bsmap_cli.fit.beams import BeamGrid, make_grid
 from bsmap_cli.fit.division import Faces, find_faces
-from bsmap_cli.fit.labels import feet_of
+from bsmap_cli.fit.labels import feet_of_faces
 from bsmap_cli.fit.lines import pose_part
 from bsmap_cli.fit.movement import Movement, divide
 from bsmap_cli.fit.surface import residuals_of
@@ -71,7 +71,8 @@ def fit_set(cloud: PointCloud, scans: IntArray, name: str, grid: BeamGrid, first
     if len(grid.ranges) < 2:
         return _Set([], [], {})
     faces = find_faces(grid)
-    trims = trim(grid, faces)
+    feet = feet_of_faces(grid, faces.labels, [fitted.field for fitted in faces.fitted])
+    trims = trim(grid, faces, feet)
     pose = (pose_part(cloud, Movement("", scans), name),)
     kept = [number for number, loops in enumerate(trims.loops) if loops]
     names = {number: f"{name}/{rank + 1:02d}" for rank, number in enumerate(kept)}
@@ -79,8 +80,7 @@ def fit_set(cloud: PointCloud, scans: IntArray, name: str, grid: BeamGrid, first
     surfaces = []
     for number in kept:
         spline, covariance = spline_of(faces.fitted[number], pose)
-        mask = (faces.labels == number) & grid.hit
-        residuals = residuals_of(np.abs(feet_of(grid, faces.fitted[number].field, mask).beyond))
+        residuals = residuals_of(np.abs(feet[number].beyond))
         loops = tuple(TrimLoop(loop.parameters, used[loop.creases]) for loop in trims.loops[number])
         surfaces.append(BSplineSurface(names[number], (name,), *spline, covariance, residuals, loops))
     return _Set(surfaces, creases, _figures(grid, faces))

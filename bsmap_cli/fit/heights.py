@@ -4,11 +4,14 @@ The noise lies along the beam, so the residual is measured along it and the para
 the model, not of the noisy point. One Gauss-Newton step is a linear least-squares problem in the heights.
 """
 
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from bsmap_cli.core.bspline import TensorSpline, clamped_knots, design_matrix, evaluate_surface, inner_knots
+from bsmap_cli.core.bspline import TensorSpline, clamped_knots, design_matrix, inner_knots
+from bsmap_cli.core.pieces import Pieces, evaluate_pieces, polynomial_pieces
 from bsmap_cli.fit.lowmodels import axes_of
 from bsmap_cli.model import Array
 
@@ -16,6 +19,16 @@ SETTLED = 1e-6
 """Metres; a step of Newton's method below this is the last one."""
 STEEPEST = 0.05
 """Smallest sine between beam and surface that counts."""
+
+
+def _turned(vectors: Array, axes: Array) -> Array:
+    """Vectors (..., 3) in axes (3, 3); of a plain list, columns in one piece: long operations on them are quick."""
+    return (axes.T @ vectors.T).T if vectors.ndim == 2 else vectors @ axes
+
+
+def _columns(*columns: Array) -> Array:
+    """(n, k) of k columns (n,), each in one piece: long operations on them are quick."""
+    return np.array(columns).T
 
 
 class PlaneBase(NamedTuple):
@@ -26,11 +39,16 @@ class PlaneBase(NamedTuple):
 
     def local(self, points: Array) -> Array:
         """(..., 3) s, t, h of points (..., 3)."""
-        return (points - self.origin) @ self.axes
+        return _turned(points - self.origin, self.axes)
 
     def turn(self, local: Array, directions: Array) -> Array:
         """(..., 3) change of s, t, h along unit directions (..., 3) at places `local`."""
-        return directions @ self.axes
+        return _turned(directions, self.axes)
+
+    def normal(self, local: Array, gradient: Array) -> Array:
+        """(n, 3) gradient in map of the height above a field whose own is (n, 2) at places `local` (n, 3)."""
+        s, t, h = self.axes.T
+        return h - gradient[:, :1] * s - gradient[:, 1:] * t
 
     def place(self, local: Array) -> Array:
         """Points (..., 3) in map of s, t, h (..., 3)."""
@@ -56,6 +74,12 @@ class CylinderBase(NamedTuple):
         around = directions[..., 1] * c - directions[..., 0] * s
         distance = np.maximum(self.radius + local[..., 2], 0.1 * self.radius)
         return np.stack([around * self.radius / distance, directions[..., 2], outwards], axis=-1)
+
+    def normal(self, local: Array, gradient: Array) -> Array:
+        angle = local[:, 0] / self.radius + self.middle
+        c, s = np.cos(angle), np.sin(angle)
+        around = gradient[:, 0] * self.radius / np.maximum(self.radius + local[:, 2], 0.1 * self.radius)
+        return _columns(c + around * s, s - around * c, -gradient[:, 1])
 
     def place(self, local: Array) -> Array:
         angle, distance = local[..., 0] / self.radius + self.middle, self.radius + local[..., 2]
@@ -90,7 +114,8 @@ def flat_knots() -> Knots:
     return Knots(1, 1, np.array([0.0, 0.0, 1.0, 1.0]), np.array([0.0, 0.0, 1.0, 1.0]))
 
 
-class HeightField(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class HeightField:
     """Heights over a base on the rectangle from `low` (2,) to `high` (2,) in s and t, metres; heights (ns, nt)."""
 
     base: Base
@@ -101,7 +126,13 @@ class HeightField(NamedTuple):
 
     def parameters(self, local: Array) -> Array:
         """(n, 2) u, v in [0, 1] inside the rectangle, beyond it outside, of s, t, h (n, 3)."""
-        return (local[:, :2] - self.low) / (self.high - self.low)
+        return _columns(*((local[:, k] - self.low[k]) / (self.high[k] - self.low[k]) for k in (0, 1)))
+
+    @cached_property
+    def pieces(self) -> Pieces:
+        """Polynomials of the heights, prepared once for all evaluations."""
+        k = self.knots
+        return polynomial_pieces(TensorSpline(k.degree_s, k.degree_t, k.s, k.t, self.heights[:, :, None]))
 
 
 class Feet(NamedTuple):
@@ -119,15 +150,13 @@ class Feet(NamedTuple):
 
 def evaluate(field: HeightField, uv: Array) -> tuple[Array, Array]:
     """Heights (n,) and their gradients (n, 2) by s and t; beyond the rectangle the surface goes on straight."""
-    k = field.knots
-    if k.shape == (2, 2):
+    if field.knots.shape == (2, 2):
         return _bilinear(field, uv)
     inside = np.clip(uv, 0.0, 1.0)
-    spline = TensorSpline(k.degree_s, k.degree_t, k.s, k.t, field.heights[:, :, None])
-    value, by_u, by_v = evaluate_surface(spline, inside[:, 0], inside[:, 1], 1)[:, :, 0]
-    gradient = np.stack([by_u, by_v], axis=1)
-    height = value + np.sum(gradient * (uv - inside), axis=1)
-    return height, gradient / (field.high - field.low)
+    value, by_u, by_v = evaluate_pieces(field.pieces, inside[:, 0], inside[:, 1], 1)[:, 0]
+    height = value + by_u * (uv[:, 0] - inside[:, 0]) + by_v * (uv[:, 1] - inside[:, 1])
+    size = field.high - field.low
+    return height, _columns(by_u / size[0], by_v / size[1])
 
 
 def _bilinear(field: HeightField, uv: Array) -> tuple[Array, Array]:
@@ -135,20 +164,27 @@ def _bilinear(field: HeightField, uv: Array) -> tuple[Array, Array]:
     (a, b), (c, d) = field.heights
     u, v = uv[:, 0], uv[:, 1]
     twist = a - b - c + d
-    gradient = np.stack([c - a + twist * v, b - a + twist * u], axis=1)
-    return a + (c - a) * u + (b - a) * v + twist * u * v, gradient / (field.high - field.low)
+    size = field.high - field.low
+    gradient = _columns((c - a + twist * v) / size[0], (b - a + twist * u) / size[1])
+    return a + (c - a) * u + (b - a) * v + twist * u * v, gradient
 
 
 def find_feet(field: HeightField, points: Array, directions: Array, steps: int = 3) -> Feet:
     """Feet of beams through points (n, 3) along unit directions (n, 3), by Newton's method from the points."""
     beyond = np.zeros(len(points))
+    start, turn = field.base.local(points), np.zeros_like(points)
+    # Over a plane s, t and h change evenly along a beam.
+    straight = isinstance(field.base, PlaneBase)
+    if straight:
+        turn = field.base.turn(start, directions)
     done = False
     for step in range(steps + 1):
-        local = field.base.local(points + beyond[:, None] * directions)
+        local = start + beyond[:, None] * turn if straight else field.base.local(points + beyond[:, None] * directions)
         uv = field.parameters(local)
         height, gradient = evaluate(field, uv)
-        turn = field.base.turn(local, directions)
-        slope = turn[:, 2] - np.sum(gradient * turn[:, :2], axis=1)
+        if not straight:
+            turn = field.base.turn(local, directions)
+        slope = turn[:, 2] - gradient[:, 0] * turn[:, 0] - gradient[:, 1] * turn[:, 1]
         slope = np.where(np.abs(slope) < STEEPEST, np.where(slope < 0.0, -STEEPEST, STEEPEST), slope)
         if done or step == steps:
             break
@@ -162,11 +198,9 @@ def offset(field: HeightField, points: Array) -> tuple[Array, Array]:
     """Heights (n,) of points (n, 3) above the field, to first order their distances, and unit normals (n, 3) there."""
     local = field.base.local(points)
     height, gradient = evaluate(field, field.parameters(local))
-    # turn() of the axes of map gives the derivatives of s, t, h by x, y, z.
-    by_axis = np.stack([field.base.turn(local, np.broadcast_to(axis, points.shape)) for axis in np.eye(3)], axis=1)
-    slope = by_axis[:, :, 2] - np.einsum("nak,nk->na", by_axis[:, :, :2], gradient)
-    length = np.linalg.norm(slope, axis=1, keepdims=True)
-    return (local[:, 2] - height) / length[:, 0], slope / length
+    slope = field.base.normal(local, gradient)
+    length = np.sqrt(np.sum(slope**2, axis=1))
+    return (local[:, 2] - height) / length, slope / length[:, None]
 
 
 def plane_base(points: Array, normal: Array) -> PlaneBase:

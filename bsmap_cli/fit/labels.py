@@ -44,6 +44,11 @@ def feet_of(grid: BeamGrid, field: HeightField, mask: NDArray[np.bool_]) -> Feet
     return find_feet(field, grid.points[mask], grid.directions[mask])
 
 
+def feet_of_faces(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField]) -> list[Feet]:
+    """Feet of the beams of each face that have a return, in the order of the grid."""
+    return [feet_of(grid, field, (labels == number) & grid.hit) for number, field in enumerate(fields)]
+
+
 def drop_outliers(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], sigma: float) -> IntArray:
     """Labels without the beams that miss their face by more than noise, or that graze it."""
     labels = labels.copy()

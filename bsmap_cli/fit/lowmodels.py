@@ -4,6 +4,7 @@ Both are linear in their unknowns, so that a region is held by sums (A, b, s): c
 x'A x - 2 b'x + s, and adding data is adding sums.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -45,42 +46,38 @@ class CylinderFrame(NamedTuple):
 Frame = PlaneFrame | CylinderFrame
 
 
-def chi_square(sums: Sums, size: int) -> float:
-    """Chi square of the best of the first `size` unknowns."""
-    A, b = sums.A[:size, :size], sums.b[:size]
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(A), 1e-300))
-    scaled = A * scale[:, None] * scale + 1e-11 * np.eye(size)
-    return float(sums.s - (b * scale) @ np.linalg.solve(scaled, b * scale))
+def chi_squares(sums: Sums, sizes: Sequence[int]) -> Array:
+    """Chi squares (k,) of the best of the first so many unknowns, sizes (k,) ascending, out of one factorisation."""
+    n = sizes[-1]
+    A, b = sums.A[:n, :n], sums.b[:n]
+    scale = 1.0 / np.sqrt(np.maximum(A.diagonal(), 1e-300))
+    bordered = np.zeros((n + 1, n + 1))
+    bordered[:n, :n] = A * scale[:, None] * scale
+    bordered[n, :n] = b * scale
+    bordered.flat[:: n + 2] += 1e-11
+    bordered[n, n] = 2.0 * sums.s + 1.0  # more than can be explained: keeps the matrix positive definite
+    explained = np.cumsum(np.linalg.cholesky(bordered)[n, :n] ** 2)
+    return np.asarray(sums.s - explained[np.array(sizes) - 1])
 
 
-def polynomials(s: Array, t: Array) -> Array:
-    """(n, 15) monomials up to degree 4, by degree."""
-    one, ss, tt = np.ones_like(s), s * s, t * t
-    terms = [
-        one,
-        s,
-        t,
-        ss,
-        s * t,
-        tt,
-        ss * s,
-        ss * t,
-        s * tt,
-        tt * t,
-        ss * ss,
-        ss * s * t,
-        ss * tt,
-        s * tt * t,
-        tt * tt,
-    ]
-    return np.stack(terms, axis=-1)
+def polynomials(s: Array, t: Array, size: int) -> Array:
+    """(n, size) monomials by degree, at most up to degree 4."""
+    out = np.empty((size, len(s)))
+    out[0] = 1.0
+    first = 0
+    for degree in range(1, ORDERS.index(size) + 2):
+        stop = first + degree
+        np.multiply(out[first:stop], s, out=out[stop : stop + degree])
+        np.multiply(out[stop - 1], t, out=out[stop + degree])
+        first = stop
+    return out.T
 
 
-def plane_rows(frame: PlaneFrame, blocks: Blocks) -> tuple[Array, Array, Array]:
-    """Monomials (n, 15), heights (n,) and 1 / sine of incidence (n,) of blocks over a plane."""
+def plane_rows(frame: PlaneFrame, blocks: Blocks, size: int = ORDERS[-1]) -> tuple[Array, Array, Array]:
+    """First monomials (n, size), heights (n,) and 1 / sine of incidence (n,) of blocks over a plane."""
     local = (blocks.points - frame.origin) @ frame.axes
     sine = np.maximum(np.abs(blocks.directions @ frame.axes[:, 2]), GRAZING)
-    return polynomials(local[:, 0], local[:, 1]), local[:, 2], 1.0 / sine
+    return polynomials(local[:, 0], local[:, 1], size), local[:, 2], 1.0 / sine
 
 
 def cylinder_rows(frame: CylinderFrame, blocks: Blocks) -> tuple[Array, Array, Array]:
@@ -91,13 +88,22 @@ def cylinder_rows(frame: CylinderFrame, blocks: Blocks) -> tuple[Array, Array, A
     return rows, np.sum(xy * xy, axis=1), 1.0 / (2.0 * np.maximum(along, 2.0 * GRAZING * frame.radius))
 
 
-def sums_of(frame: Frame, blocks: Blocks, sigma: float) -> Sums:
-    """Sums of all blocks together."""
+def weighted_rows(frame: Frame, blocks: Blocks, sigma: float) -> tuple[Array, Array]:
+    """Rows (n, k) and data (n,) of blocks in standard deviations."""
     rows = plane_rows(frame, blocks) if isinstance(frame, PlaneFrame) else cylinder_rows(frame, blocks)
     N, data, root = rows
     root = root * np.sqrt(blocks.counts) / sigma
-    N, data = N * root[:, None], data * root
+    return N * root[:, None], data * root
+
+
+def sums_of_rows(N: Array, data: Array) -> Sums:
+    """Sums of weighted rows (n, k) and data (n,)."""
     return Sums(N.T @ N, N.T @ data, float(data @ data))
+
+
+def sums_of(frame: Frame, blocks: Blocks, sigma: float) -> Sums:
+    """Sums of all blocks together."""
+    return sums_of_rows(*weighted_rows(frame, blocks, sigma))
 
 
 def fit_plane_frame(blocks: Blocks, rough_normal: Array | None = None) -> PlaneFrame:
@@ -108,9 +114,9 @@ def fit_plane_frame(blocks: Blocks, rough_normal: Array | None = None) -> PlaneF
         rough_normal = np.linalg.eigh(centred.T @ centred)[1][:, 0]
     frame = PlaneFrame(origin, axes_of(rough_normal))
     for _ in range(2):
-        N, data, root = plane_rows(frame, blocks)
+        N, data, root = plane_rows(frame, blocks, 3)
         root = root * np.sqrt(blocks.counts)
-        slopes = np.linalg.lstsq(N[:, :3] * root[:, None], data * root, rcond=1e-9)[0]
+        slopes = np.linalg.lstsq(N * root[:, None], data * root, rcond=1e-9)[0]
         normal = frame.axes @ np.array([-slopes[1], -slopes[2], 1.0])
         frame = PlaneFrame(frame.origin + slopes[0] * frame.axes[:, 2], axes_of(normal))
     return frame

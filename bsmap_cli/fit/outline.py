@@ -36,70 +36,102 @@ def outline(
     uv : (m, n, 2) parameters of the face's beams.  crossing_uv : (k, 2) of all crossings on this face.
     believed : (m - 1, n - 1) cells that count.
     """
-    m, n = labels.shape
     member = labels == face
     corners = np.stack([member[:-1, :-1], member[:-1, 1:], member[1:, 1:], member[1:, :-1]])
     full = np.all(corners, axis=0) & believed
     mixed = np.any(corners, axis=0) & ~full & believed
-    quads = np.stack([uv[:-1, :-1], uv[:-1, 1:], uv[1:, 1:], uv[1:, :-1]], axis=2)
-    area = np.where(full, signed_area(quads), 0.0)
-    edges: tuple[dict[tuple[int, int], int], dict[tuple[int, int], int]] = (defaultdict(int), defaultdict(int))
-    for mirrored in (False, True):
-        _add_full(edges[mirrored], full & (area < 0.0 if mirrored else area >= 0.0), n)
-    for row, column in np.argwhere(mixed).tolist():
-        polygon = _share(face, labels, crossings, row, column)
-        if len(polygon) < 3:
-            continue
-        at = np.array([crossing_uv[v - m * n] if v >= m * n else uv[v // n, v % n] for v in polygon])
-        mirrored = bool(signed_area(at) < 0.0)
-        for a, b in zip(polygon, polygon[1:] + polygon[:1], strict=True):
-            _add(edges[mirrored], a, b)
-    loops = chain(edges[False])
-    loops += [loop[::-1] for loop in chain(edges[True])]
+    mirrored = np.zeros_like(full)
+    cells = np.nonzero(full)
+    mirrored[cells] = signed_area(np.stack([uv[cells[0] + i, cells[1] + k] for i, k in CORNERS], axis=1)) < 0.0
+    shares = _shares(face, labels, crossings, *np.nonzero(mixed))
+    at = np.concatenate([uv.reshape(-1, 2), crossing_uv])[shares.vertices]
+    backwards = _areas(shares, at) < 0.0
+    loops: list[list[int]] = []
+    for turned in (False, True):
+        edges = np.concatenate([_border(full & (mirrored == turned)), _edges(shares, backwards == turned)])
+        loops += [loop[::-1] if turned else loop for loop in chain(_left_over(edges))]
     return Loops(loops)
 
 
-def _add(edges: dict[tuple[int, int], int], a: int, b: int) -> None:
-    """Add a directed edge; it cancels one that goes the other way."""
-    if edges.get((b, a), 0) > 0:
-        edges[(b, a)] -= 1
-    else:
-        edges[(a, b)] += 1
+class _Shares(NamedTuple):
+    """Polygons of a face's shares of cells: all vertices (k,), polygon after polygon; where each begins (p,)."""
+
+    vertices: IntArray
+    first: IntArray
+
+    @property
+    def following(self) -> IntArray:
+        """(k,) vertex after each in its polygon."""
+        out = np.roll(self.vertices, -1)
+        out[np.append(self.first, len(out))[1:] - 1] = self.vertices[self.first]
+        return out
+
+    @property
+    def of(self) -> IntArray:
+        """(k,) number of the polygon of each vertex."""
+        return np.repeat(np.arange(len(self.first)), np.diff(np.append(self.first, len(self.vertices))))
 
 
-def _add_full(edges: dict[tuple[int, int], int], full: NDArray[np.bool_], n: int) -> None:
-    """Add those sides of whole cells that no other whole cell shares."""
+def _shares(face: int, labels: IntArray, crossings: Crossings, row: IntArray, column: IntArray) -> _Shares:
+    """A face's shares of cells (k,): its corners, and the crossings on sides to other faces, where these are 3."""
+    m, n = labels.shape
+    own = np.stack([labels[row + i, column + k] == face for i, k in CORNERS], axis=1)
+    border = own != np.roll(own, -1, axis=1)
+    table = np.full((len(row), 8), -1)
+    for side, ((i, k), kind) in enumerate(SIDES):
+        corner = (row + CORNERS[side][0]) * n + column + CORNERS[side][1]
+        table[:, 2 * side] = np.where(own[:, side], corner, -1)
+        number = (crossings.along if kind == "along" else crossings.across)[row + i, column + k]
+        table[:, 2 * side + 1] = np.where(border[:, side] & (number >= 0), m * n + number, -1)
+    table = table[np.count_nonzero(table >= 0, axis=1) >= 3]
+    count = np.count_nonzero(table >= 0, axis=1)
+    return _Shares(table[table >= 0], np.cumsum(count) - count)
+
+
+def _areas(shares: _Shares, at: Array) -> Array:
+    """Signed areas (p,) of polygons whose vertices lie at (k, 2)."""
+    if not len(shares.first):
+        return np.zeros(0)
+    of = shares.of
+    x, y = (at - at[shares.first][of]).T
+    behind = np.arange(1, len(of) + 1)
+    behind[np.append(shares.first, len(of))[1:] - 1] = shares.first
+    return np.asarray(0.5 * np.add.reduceat(x * y[behind] - x[behind] * y, shares.first))
+
+
+def _edges(shares: _Shares, keep: NDArray[np.bool_]) -> IntArray:
+    """(k, 2) directed edges of the polygons to keep (p,)."""
+    return np.column_stack([shares.vertices, shares.following])[keep[shares.of]]
+
+
+def _border(full: NDArray[np.bool_]) -> IntArray:
+    """(k, 2) those directed sides of whole cells that no other whole cell shares."""
+    n = full.shape[1] + 1
     padded = np.pad(full, 1)
     shifts = (padded[:-2, 1:-1], padded[1:-1, 2:], padded[2:, 1:-1], padded[1:-1, :-2])
+    out = []
     for side, neighbour in enumerate(shifts):
-        start, end = CORNERS[side], CORNERS[(side + 1) % 4]
         row, column = np.nonzero(full & ~neighbour)
-        for i, k in zip(row.tolist(), column.tolist(), strict=True):
-            _add(edges, (i + start[0]) * n + k + start[1], (i + end[0]) * n + k + end[1])
+        ends = [(row + i) * n + column + k for i, k in (CORNERS[side], CORNERS[(side + 1) % 4])]
+        out.append(np.column_stack(ends))
+    return np.concatenate(out)
 
 
-def _share(face: int, labels: IntArray, crossings: Crossings, row: int, column: int) -> list[int]:
-    """Polygon of a face's share of a cell: its corners, and the crossings on sides to other faces."""
-    m, n = labels.shape
-    out: list[int] = []
-    for side in range(4):
-        a, b = CORNERS[side], CORNERS[(side + 1) % 4]
-        here, there = labels[row + a[0], column + a[1]], labels[row + b[0], column + b[1]]
-        if here == face:
-            out.append((row + a[0]) * n + column + a[1])
-        if (here == face) != (there == face):
-            first, kind = SIDES[side]
-            number = (crossings.along if kind == "along" else crossings.across)[row + first[0], column + first[1]]
-            if number >= 0:
-                out.append(m * n + int(number))
-    return out
+def _left_over(edges: IntArray) -> IntArray:
+    """(j, 2) of directed edges (k, 2), those that no edge the other way cancels."""
+    size = int(edges.max(initial=0)) + 1
+    there, count = np.unique(edges[:, 0] * size + edges[:, 1], return_counts=True)
+    back = there % size * size + there // size
+    at = np.minimum(np.searchsorted(there, back), len(there) - 1)
+    left = np.repeat(there, np.maximum(count - np.where(there[at] == back, count[at], 0), 0))
+    return np.column_stack([left // size, left % size])
 
 
-def chain(edges: dict[tuple[int, int], int]) -> list[list[int]]:
-    """Closed loops of directed edges."""
+def chain(edges: IntArray) -> list[list[int]]:
+    """Closed loops of directed edges (k, 2)."""
     following: dict[int, list[int]] = defaultdict(list)
-    for (a, b), count in sorted(edges.items()):
-        following[a] += [b] * count
+    for a, b in edges[np.lexsort(edges.T[::-1])].tolist():
+        following[a].append(b)
     loops = []
     for start in sorted(following):
         while following[start]:

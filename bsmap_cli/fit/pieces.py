@@ -43,7 +43,7 @@ def find_pieces(grid: BeamGrid) -> Pieces:
     for row in range(len(grid.ranges)):
         for first, last in _stretches(grid.hit[row]):
             places = _candidates(grid, gain[:, row], row, first, last)
-            found += [(row, *piece) for piece in _divide(moments[row], places)]
+            found += [(row, *piece) for piece in _divide(moments[:, row, places], places)]
     if not found:
         none = np.zeros(0, dtype=np.int64)
         return Pieces(none, none, none, np.zeros(0, dtype=bool))
@@ -55,50 +55,53 @@ def find_pieces(grid: BeamGrid) -> Pieces:
 
 
 def _prefix_moments(grid: BeamGrid) -> Array:
-    """(m, n + 1, 11) sums over beams before each: W {cc, cs, ss, c, s, 1}, W w {c, s, 1}, W w^2, number of returns."""
+    """(11, m, n + 1) sums over beams before each: W {cc, cs, ss, c, s, 1}, W w {c, s, 1}, W w^2, number of returns."""
     m, n = grid.ranges.shape
     r = np.where(grid.hit, grid.ranges, 1.0)
     W = np.where(grid.hit, r**4 / grid.sigma**2, 0.0)
     w, c, s = 1.0 / r, np.cos(grid.angles), np.sin(grid.angles)
-    terms = np.stack(
-        [W * c * c, W * c * s, W * s * s, W * c, W * s, W, W * w * c, W * w * s, W * w, W * w * w, grid.hit * 1.0], -1
-    )
-    out = np.zeros((m, n + 1, 11))
-    np.cumsum(terms, axis=1, out=out[:, 1:])
+    terms = (W * c * c, W * c * s, W * s * s, W * c, W * s, W, W * w * c, W * w * s, W * w, W * w * w, grid.hit * 1.0)
+    out = np.zeros((11, m, n + 1))
+    for term, sums in zip(terms, out, strict=True):
+        np.cumsum(term, axis=1, out=sums[:, 1:])
     return out
 
 
 def _chi_line(d: Array) -> Array:
-    """Chi square (...) of the best line by moments (..., 11)."""
-    cc, cs, ss, wc, ws, ww = d[..., 0], d[..., 1], d[..., 2], d[..., 6], d[..., 7], d[..., 9]
+    """Chi square (...) of the best line by moments (11, ...)."""
+    cc, cs, ss, _, _, _, wc, ws, _, ww, number = d
     determinant = cc * ss - cs * cs
-    explained = (ss * wc * wc - 2.0 * cs * wc * ws + cc * ws * ws) / np.where(determinant > 0.0, determinant, 1.0)
-    return np.where((d[..., 10] >= 2) & (determinant > 0.0), np.maximum(ww - explained, 0.0), 0.0)
+    good = (number >= 2) & (determinant > 0.0)
+    explained = (ss * wc * wc - 2.0 * cs * wc * ws + cc * ws * ws) / np.where(good, determinant, 1.0)
+    return np.where(good, np.maximum(ww - explained, 0.0), 0.0)
 
 
 def _normal(d: Array, size: int) -> tuple[Array, Array]:
-    """Normal matrices (..., size, size) and right sides (..., size) of lines (2) and conics (3)."""
-    A = d[..., [[0, 1, 3], [1, 2, 4], [3, 4, 5]]][..., :size, :size]
-    return A, d[..., 6 : 6 + size]
+    """Normal matrices (k, size, size) and right sides (k, size) of lines (2) and conics (3) by moments (11, k)."""
+    A = d[[[0, 1, 3], [1, 2, 4], [3, 4, 5]]][:size, :size]
+    return A.transpose(2, 0, 1), d[6 : 6 + size].T
 
 
 def _chi_conic(d: Array) -> Array:
     A, b = _normal(d, 3)
     x = np.linalg.solve(A + 1e-12 * np.trace(A, axis1=-2, axis2=-1)[..., None, None] * np.eye(3), b[..., None])[..., 0]
-    return np.asarray(np.maximum(d[..., 9] - np.sum(b * x, axis=-1), 0.0))
+    return np.asarray(np.maximum(d[9] - np.sum(b * x, axis=-1), 0.0))
 
 
 def _break_gain(moments: Array) -> Array:
     """(windows, m, n + 1) gain in chi square of a break before each beam, at several half windows."""
-    n = moments.shape[1] - 1
-    at = np.arange(n + 1)
-    out = []
-    for half in WINDOWS:
-        low, high = np.maximum(at - half, 0), np.minimum(at + half, n)
-        left, right = moments - moments[:, low], moments[:, high] - moments
-        gain = _chi_line(left + right) - _chi_line(left) - _chi_line(right)
-        out.append(np.where((left[..., 10] >= 3) & (right[..., 10] >= 3), gain, 0.0))
-    return np.array(out)
+    _, m, places = moments.shape
+    out = np.empty((len(WINDOWS), m, places))
+    at = np.arange(places)
+    for row in range(m):
+        here = moments[:, row]
+        for k, half in enumerate(WINDOWS):
+            low, high = np.maximum(at - half, 0), np.minimum(at + half, places - 1)
+            before, behind = here[:, low], here[:, high]
+            both, left, right = _chi_line(np.stack([behind - before, here - before, behind - here], axis=1))
+            enough = (here[10] - before[10] >= 3) & (behind[10] - here[10] >= 3)
+            out[k, row] = np.where(enough, both - left - right, 0.0)
+    return out
 
 
 def _stretches(hit: NDArray[np.bool_]) -> list[tuple[int, int]]:
@@ -116,28 +119,30 @@ def _candidates(grid: BeamGrid, gain: Array, row: int, first: int, stop: int) ->
     places = [np.array([first, stop])]
     for half, g in zip(WINDOWS, gain[:, first : stop + 1], strict=True):
         reach = max(2, half // 4)
-        padded = np.pad(g, reach, constant_values=-1.0)
-        peak = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1).max(axis=1)
-        places.append(first + np.flatnonzero((g >= peak) & (g > CANDIDATE)))
-    r = grid.ranges[row, first:stop]
-    step = np.abs(np.diff(r))
-    around = np.nanmedian(step) if len(step) else 0.0
-    places.append(first + 1 + np.flatnonzero(step > 8.0 * grid.sigma + 3.0 * around))
+        high = np.flatnonzero(g > CANDIDATE)
+        around = np.clip(high[:, None] + np.arange(-reach, reach + 1), 0, len(g) - 1)
+        places.append(first + high[g[high] >= g[around].max(axis=1)])
+    step = np.abs(np.diff(grid.ranges[row, first:stop]))
+    known = step[np.isfinite(step)]
+    usual = np.median(known) if len(known) else 0.0
+    places.append(first + 1 + np.flatnonzero(step > 8.0 * grid.sigma + 3.0 * usual))
     return np.unique(np.concatenate(places))
 
 
 def _divide(moments: Array, places: IntArray) -> list[tuple[int, int, bool]]:
-    """Cheapest division of the stretch between the first and the last place into lines, conics and junk."""
-    at = moments[places]
+    """Cheapest division of the stretch between the first and the last place (k,) into lines, conics and junk.
+
+    moments : (11, k) of the beams before each place.
+    """
     i, j = np.triu_indices(len(places), 1)
-    d = at[j] - at[i]
-    count = d[:, 10]
+    d = moments[:, j] - moments[:, i]
+    count = d[10]
     line = np.where(count >= FEWEST, _chi_line(d) + LINE_COST, np.inf)
     conic = np.full(len(i), np.inf)
     # A conic is worth a look only where it could be cheaper than the line.
     look = (count >= FEWEST_CONIC) & (line - LINE_COST > CONIC_COST - LINE_COST)
     if look.any():
-        conic[look] = _chi_conic(d[look]) + CONIC_COST
+        conic[look] = _chi_conic(d[:, look]) + CONIC_COST
     junk = JUNK_COST + JUNK_BEAM * count
     kind = np.argmin([line, conic, junk], axis=0)
     costs = np.full((len(places), len(places)), np.inf)
@@ -160,12 +165,12 @@ def _divide(moments: Array, places: IntArray) -> list[tuple[int, int, bool]]:
 
 def _relocate(grid: BeamGrid, moments: Array, pieces: Pieces) -> Pieces:
     """Move the breaks between touching pieces to where the two models together fit best."""
-    d = moments[pieces.row, pieces.stop] - moments[pieces.row, pieces.start]
-    models = np.zeros((len(d), 3))
+    d = moments[:, pieces.row, pieces.stop] - moments[:, pieces.row, pieces.start]
+    models = np.zeros((len(pieces.row), 3))
     A, b = _normal(d, 2)
     models[:, :2] = np.linalg.solve(A, b[..., None])[..., 0]
     if pieces.curved.any():
-        A, b = _normal(d[pieces.curved], 3)
+        A, b = _normal(d[:, pieces.curved], 3)
         models[pieces.curved] = np.linalg.solve(A, b[..., None])[..., 0]
     start, stop = pieces.start.copy(), pieces.stop.copy()
     basis = np.stack([np.cos(grid.angles), np.sin(grid.angles), np.ones(len(grid.angles))])

@@ -5,13 +5,15 @@ surfaces of higher order and a statistical criterion: a piece joins where that r
 parameters are worth.
 """
 
+import functools
+import itertools
 from collections import deque
 
 import numpy as np
 
 from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.context import PRICE, Context, make_context
-from bsmap_cli.fit.lowmodels import ORDERS, Frame, PlaneFrame, chi_square, sums_of
+from bsmap_cli.fit.lowmodels import ORDERS, Frame, PlaneFrame, Sums, chi_squares, sums_of_rows, weighted_rows
 from bsmap_cli.fit.pieces import Pieces
 from bsmap_cli.fit.seeds import bent_seeds, cylinder_seeds, plane_seeds
 from bsmap_cli.fit.unions import unite_regions
@@ -43,12 +45,21 @@ def _sizes(frame: Frame, rows: int) -> tuple[int, ...]:
     return tuple(size for size, least in zip(ORDERS, (1, 5, 8, 12), strict=True) if rows >= least)[:3]
 
 
+def _cost(sums: Sums, frame: Frame, rows: int) -> float:
+    """Least criterion over the orders allowed."""
+    sizes = _sizes(frame, rows)
+    return float(np.min(chi_squares(sums, sizes) + PRICE * np.array(sizes)))
+
+
 def _grow(context: Context, owner: IntArray, seed: list[int], frame: Frame) -> list[int]:
     """Pieces that the seed's surface reaches, scan by scan, its order rising as the data ask for it."""
-    members, rows = list(seed), {int(context.pieces.row[k]) for k in seed}
-    sums = sums_of(frame, context.blocks_of(seed), context.sigma)
-    taken = set(seed)
-    cost = min(chi_square(sums, size) + PRICE * size for size in _sizes(frame, len(rows)))
+    N, data = weighted_rows(frame, context.blocks, context.sigma)
+    N = N[:, : _sizes(frame, len(N))[-1]]
+    spans = [slice(*ends) for ends in itertools.pairwise(context.first.tolist())]
+    sums = functools.reduce(Sums.plus, [sums_of_rows(N[spans[k]], data[spans[k]]) for k in seed])
+    row = context.pieces.row.tolist()
+    members, rows, taken = list(seed), {row[k] for k in seed}, set(seed)
+    cost = _cost(sums, frame, len(rows))
     waiting = deque(k for member in seed for k in context.neighbours[member])
     tries: dict[int, int] = {}
     while waiting:
@@ -56,13 +67,12 @@ def _grow(context: Context, owner: IntArray, seed: list[int], frame: Frame) -> l
         if k in taken or owner[k] >= 0 or tries.get(k, 0) > 3:
             continue
         tries[k] = tries.get(k, 0) + 1
-        more = sums.plus(sums_of(frame, context.blocks_of([k]), context.sigma))
-        sizes = _sizes(frame, len(rows | {int(context.pieces.row[k])}))
-        joint = min(chi_square(more, size) + PRICE * size for size in sizes)
+        more = sums.plus(sums_of_rows(N[spans[k]], data[spans[k]]))
+        joint = _cost(more, frame, len(rows | {row[k]}))
         if joint < cost + context.chi[k] + context.price[k] + context.slack * context.beams[k]:
             members.append(k)
             taken.add(k)
-            rows.add(int(context.pieces.row[k]))
+            rows.add(row[k])
             sums, cost = more, joint
             waiting.extend(context.neighbours[k])
     return members

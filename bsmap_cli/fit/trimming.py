@@ -1,5 +1,6 @@
 """Trim loops of faces and the creases that they share."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.crossings import Crossings, find_crossings
 from bsmap_cli.fit.division import Faces
 from bsmap_cli.fit.ends import doubtful_cells, find_ends, on_faces, within_ends
-from bsmap_cli.fit.heights import HeightField
+from bsmap_cli.fit.heights import Feet, HeightField
 from bsmap_cli.fit.labels import feet_of
 from bsmap_cli.fit.outline import outline
 from bsmap_cli.model import Array, IntArray, TrimLoop
@@ -35,19 +36,19 @@ class Trims(NamedTuple):
     creases: list[CreaseLine]
 
 
-def trim(grid: BeamGrid, faces: Faces) -> Trims:
-    """Outlines of all faces, with few vertices, and creases stored once."""
+def trim(grid: BeamGrid, faces: Faces, feet: Sequence[Feet]) -> Trims:
+    """Outlines of all faces, with few vertices, and creases stored once; feet of the beams of each face."""
     fields = [fitted.field for fitted in faces.fitted]
     crossings = find_crossings(grid, faces.labels, fields)
     ends = find_ends(grid, faces.labels, crossings)
-    clean = on_faces(grid, faces.labels, fields)
+    clean = on_faces(grid, faces.labels, feet)
     doubtful = doubtful_cells(clean, faces.labels, fields, crossings, ends)
     crossings = within_ends(clean, faces.labels, fields, crossings, ends)
     creases: dict[tuple[int, ...], int] = {}
     lines: list[CreaseLine] = []
     loops = []
     for number, field in enumerate(fields):
-        uv = _node_parameters(grid, faces.labels, number, field)
+        uv = _node_parameters(grid, faces.labels, number, field, feet[number])
         at_crossings = field.parameters(field.base.local(crossings.points))
         found = outline(number, faces.labels, crossings, uv, at_crossings, ~doubtful)
         sides = _Sides(field, uv.reshape(-1, 2), at_crossings, crossings, creases, lines)
@@ -55,12 +56,11 @@ def trim(grid: BeamGrid, faces: Faces) -> Trims:
     return Trims(loops, lines)
 
 
-def _node_parameters(grid: BeamGrid, labels: IntArray, number: int, field: HeightField) -> Array:
+def _node_parameters(grid: BeamGrid, labels: IntArray, number: int, field: HeightField, feet: Feet) -> Array:
     """(m, n, 2) parameters of a face's beams; of beams without return between them, by their neighbours."""
     member = labels == number
     uv = np.full((*labels.shape, 2), np.nan)
     seen = member & grid.hit
-    feet = feet_of(grid, field, seen)
     short = _stands_on(grid, labels, number, field)[seen] & (feet.beyond > 0.0)
     uv[seen] = np.where(short[:, None], field.parameters(field.base.local(grid.points[seen])), feet.uv)
     for row in np.flatnonzero((member & ~grid.hit).any(axis=1)):

@@ -9,10 +9,9 @@ from bsmap_cli.fit.context import PRICE, Context
 from bsmap_cli.fit.lowmodels import (
     ORDERS,
     PlaneFrame,
-    chi_square,
+    chi_squares,
     fit_cylinder_frame,
     fit_plane_frame,
-    plane_rows,
     sums_of,
 )
 from bsmap_cli.model import Array
@@ -68,16 +67,16 @@ def low_order_cost(blocks: Blocks, frame: PlaneFrame, sigma: float) -> LowOrder:
     sums = sums_of(frame, blocks, sigma)
     rows = len(np.unique(blocks.row))
     sizes = tuple(size for size, least in zip(ORDERS, (1, 5, 8, 12), strict=True) if rows >= least)
-    costs = [chi_square(sums, size) + PRICE * size for size in sizes]
+    costs = chi_squares(sums, sizes) + PRICE * np.array(sizes)
     best = int(np.argmin(costs))
     # A plane, or what nearly is one, is no cylinder.
     if best > 0 or costs[0] > 2.0 * len(blocks.counts) + 50.0:
         cylinder = fit_cylinder_frame(blocks)
         if cylinder is not None:
-            by_circle = chi_square(sums_of(cylinder, blocks, sigma), 3) + 4 * PRICE
+            by_circle = float(chi_squares(sums_of(cylinder, blocks, sigma), (3,))[0]) + 4 * PRICE
             if by_circle < costs[best]:
                 return LowOrder(by_circle, True)
-    return LowOrder(costs[best], False)
+    return LowOrder(float(costs[best]), False)
 
 
 def _joined(context: Context, a: _Region, b: _Region) -> _Region | None:
@@ -87,7 +86,7 @@ def _joined(context: Context, a: _Region, b: _Region) -> _Region | None:
         return None
     if not (a.round or b.round) and abs(a.frame.axes[:, 2] @ b.frame.axes[:, 2]) < 0.7 and len(b.members) > 1:
         return None
-    height = plane_rows(a.frame, b.blocks)[1]
+    height = (b.blocks.points - a.frame.origin) @ a.frame.axes[:, 2]
     lowest = np.min(np.abs(height))
     if not (a.round or b.round) and lowest > 0.3:
         return None

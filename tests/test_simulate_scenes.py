@@ -2,11 +2,14 @@ from dataclasses import fields, is_dataclass
 
 import numpy as np
 import pytest
-from scenes import simulated
+from parallel_pairs import PAIRS
+from scenes import simulated, true_slam_map
 
+from bsmap_cli.cloud import make_cloud
 from bsmap_cli.core import se2
 from bsmap_cli.errors import ParameterError
-from bsmap_cli.params import SimulateParams
+from bsmap_cli.evaluate import transform_points
+from bsmap_cli.params import CloudParams, SimulateParams
 from bsmap_cli.simulate import SCENES, robot, simulate_scene
 from bsmap_cli.simulate.geometry import carve, room
 from bsmap_cli.simulate.path import integrate, poses_at
@@ -105,7 +108,7 @@ def test_path_keeps_clear_of_everything(name):
         assert distances.min() > 0.5
 
 
-@pytest.mark.parametrize("name", ["corridor", "loop"])
+@pytest.mark.parametrize("name", ["corridor", "loop", "walls", "steps"])
 def test_speeds_are_those_of_an_indoor_robot(name):
     path = SCENES[name]().path
     assert path.twists[:, 0].max() <= 0.6 + 1e-9
@@ -139,6 +142,20 @@ def test_log_agrees_with_its_odometry_and_truth(name):
         assert np.isnan(laser.ranges).mean() < 0.01
 
 
+@pytest.mark.parametrize("name", PAIRS)
+def test_vertical_laser_sees_both_sides_of_what_lies_close_together(name):
+    simulation = simulated(name, range_sigma=0.0)
+    points = make_cloud(true_slam_map(simulation), CloudParams()).points
+    start = np.searchsorted(simulation.truth.time_ns, simulation.log.horizontal.time_ns[0])
+    points = transform_points(simulation.truth.poses[start], points)
+    for pair in PAIRS[name]:
+        for side in (pair.first, pair.second):
+            others = np.delete(points, side.axis, axis=1)
+            on = np.abs(points[:, side.axis] - side.level) < 0.004
+            on &= np.all((others > side.low) & (others < side.high), axis=1)
+            assert np.count_nonzero(on) > 1000, (pair.name, side)
+
+
 def test_unknown_scene_names_the_scenes():
-    with pytest.raises(ParameterError, match="'attic' is not one of room, corridor, loop"):
+    with pytest.raises(ParameterError, match="'attic' is not one of room, corridor, loop, walls, steps"):
         simulate_scene("attic", SimulateParams())

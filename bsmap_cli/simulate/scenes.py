@@ -142,4 +142,57 @@ def _north_and_west() -> list[Cut]:
     ]
 
 
-SCENES: dict[str, Callable[[], Scene]] = {"room": room_scene, "corridor": corridor_scene, "loop": loop_scene}
+def walls_scene() -> Scene:
+    """Four rooms side by side, the walls between them 5, 10 and 20 cm thick, a door leaf 5 cm before a wall; 0.4 m/s.
+
+    The way winds through wide doorways along both sides of each wall.
+    """
+    mesh = carve(
+        [
+            room(0.0, 6.6, 0.0, 2.4, 0.0, 2.6),
+            solid(0.0, 0.5, 0.0, 0.9, 0.0, 1.8),
+            room(4.8, 6.1, 2.4, 2.45, 0.0, DOOR),
+            room(0.0, 6.19, 2.45, 4.85, 0.0, 2.6),
+            solid(6.1, 6.14, 2.45, 3.75, 0.01, DOOR - 0.01),  # the leaf of the first door
+            solid(2.6, 4.2, 4.5, 4.85, 0.0, 0.8),
+            room(0.7, 2.0, 4.85, 4.95, 0.0, DOOR),
+            room(0.2, 7.2, 4.95, 7.35, 0.0, 2.8),
+            solid(6.7, 7.2, 4.95, 5.6, 0.0, 1.1),
+            room(4.8, 6.1, 7.35, 7.55, 0.0, DOOR),
+            room(0.0, 6.8, 7.55, 9.95, 0.0, 2.6),
+            solid(2.0, 3.0, 9.5, 9.95, 0.0, 1.8),
+        ]
+    )
+    waypoints = [[1.0, 1.2], [5.45, 1.2], [5.45, 3.65], [1.35, 3.65], [1.35, 6.15], [5.45, 6.15], [5.45, 8.75]]
+    return Scene(mesh, along(np.array([*waypoints, [1.2, 8.75]]), radius=0.7, speed=0.4))
+
+
+def steps_scene() -> Scene:
+    """Room with steps of 4 cm in walls and floor, and an open door leaf 6 cm before a wall; 0.4 m/s, 1.5 rounds.
+
+    In the south a panel fills half of the wall, in the east one stands amid the wall; a low platform lies on the floor.
+    """
+    mesh = carve(
+        [
+            room(0.0, 7.0, 0.0, 6.0, 0.0, 2.8),
+            solid(3.4, 7.0, 0.0, 0.04, 0.0, 2.8),  # the panel in the south
+            solid(6.96, 7.0, 2.2, 3.8, 0.0, 2.1),  # the panel in the east
+            solid(2.5, 4.5, 2.3, 3.7, 0.0, 0.04),  # the platform
+            room(1.6, 2.6, 6.0, 6.15, 0.0, DOOR),
+            room(0.8, 3.4, 6.15, 7.6, 0.0, 2.6),
+            solid(2.6, 3.6, 5.9, 5.94, 0.01, DOOR - 0.01),  # the leaf of the door, turned to the wall beside it
+            solid(0.0, 0.5, 2.0, 3.2, 0.0, 1.9),
+        ]
+    )
+    round_once = [[5.7, 1.3], [5.7, 4.7], [1.3, 4.7], [1.3, 1.3]]
+    waypoints = np.array([[2.2, 1.3], *round_once, *round_once[:2], [2.8, 4.7]])
+    return Scene(mesh, along(waypoints, radius=0.7, speed=0.4))
+
+
+SCENES: dict[str, Callable[[], Scene]] = {
+    "room": room_scene,
+    "corridor": corridor_scene,
+    "loop": loop_scene,
+    "walls": walls_scene,
+    "steps": steps_scene,
+}

@@ -1,12 +1,14 @@
 """Faces over planes joined over one base in information form: heights, their knots and covariance, shares of poses.
 
-A data set A tells its control heights c_A with covariance Lambda_A^-1: the sensor part and what walls leave their
-spline by. With P_A from the heights c of the joined face to those of A, and G_A from the errors of pose e (unit
-variance each) to c_A, the sum of
+A data set A tells its control heights c_A with the sensor part C_A of their covariance. With P_A from the heights c of
+the joined face to those of A the sum of
 
-    (P_A c + G_A e - c_A)' Lambda_A (P_A c + G_A e - c_A)
+    (P_A c - c_A)' C_A^-1 (P_A c - c_A)
 
-is least. It is a sum over data sets, so that their order does not matter.
+is least. It is a sum over data sets, so that neither their order matters nor how many surveys a face was joined from.
+Walls are not perfect, and faces not quite what they are fitted to: whether data sets agree, and whether their
+differences pay for a knot, is told by Lambda_A, the inverse of C_A and the covariance of what walls leave their spline
+by. G_A leads from the errors of pose e (unit variance each) to c_A.
 """
 
 from collections.abc import Sequence
@@ -44,6 +46,8 @@ ROBUST = 3.0
 """Standard deviations beyond which a data set's heights count less (Huber)."""
 
 
+LEAST_SIGMA, ROUNDED = 1e-5, 1e-6
+"""Metres, and share of a variance, to which sensor parts are known at best: files round coordinates and covariances."""
 ALIGNED = 0.95
 """Cosine between axes that count as the same."""
 LEAST_SPAN = 0.01
@@ -65,6 +69,7 @@ class Told(NamedTuple):
 
     uv : (m, 2) parameters in the frame of samples of its rectangle.  carry : (k, m) from heights there to its own.
     heights : (k,) its own, above the frame's plane.  root : (k, k) lower triangular, root' root = Lambda.
+    sensor_root : (k, k) likewise of the inverse of the sensor part.
     covariance : (k, k) of the heights, sensor part.  by_pose : (k, 3 p), of each of its pose parts in turn.
     basis : (m, k) back from its heights to the samples.  stiffness : 1 / metres, weight of what it cannot follow there.
     degrees, inner : along s and t of the frame, of its own spline: degrees, and knots in the frame's parameters, those
@@ -75,6 +80,7 @@ class Told(NamedTuple):
     carry: Array
     heights: Array
     root: Array
+    sensor_root: Array
     covariance: Array
     by_pose: Array
     pose: tuple[PosePart, ...]
@@ -125,14 +131,20 @@ def tell(face: PlanarFace, frame: Frame, flatness: float) -> Told:
     s, t = greville(k.s, k.degree_s), greville(k.t, k.degree_t)
     at = np.stack(np.meshgrid(s, t, indexing="ij"), axis=-1).reshape(-1, 2) * (field.high - field.low)
     uneven = flatness**2 * np.exp(-cdist(at, at) / WAVE)
-    L = np.linalg.cholesky(covariance.matrix + uneven)
-    root = solve_triangular(L, np.eye(len(L)), lower=True)
+    C, pose = covariance.matrix, covariance.pose
+    known = C + np.diag(LEAST_SIGMA**2 + ROUNDED * np.diag(C))
+    root, sensor_root = _inverse_root(C + uneven), _inverse_root(known)
     uv = (local[:, :2] - frame.low) / (frame.high - frame.low)
     lifts = np.concatenate(by_pose, axis=1) if by_pose else np.zeros((len(at), 0))
     degrees, inner = _knots_in(field, frame)
     stiffness = float(np.sqrt(basis.shape[1] / basis.shape[0])) / flatness
     heights = carry @ local[:, 2]
-    return Told(uv, carry, heights, root, covariance.matrix, lifts, covariance.pose, basis, stiffness, degrees, inner)
+    return Told(uv, carry, heights, root, sensor_root, C, lifts, pose, basis, stiffness, degrees, inner)
+
+
+def _inverse_root(covariance: Array) -> Array:
+    """Lower triangular R with R' R the inverse of a covariance."""
+    return np.asarray(solve_triangular(np.linalg.cholesky(covariance), np.eye(len(covariance)), lower=True))
 
 
 def _knots_in(field: HeightField, frame: Frame) -> tuple[tuple[int, int], tuple[Array, Array]]:
@@ -223,8 +235,9 @@ def _middles(knots: Array) -> list[float]:
 
 def solve(told: Sequence[Told], frame: Frame, knots: Knots) -> Joined:
     """Heights on given knots; data sets that disagree count less (two rounds)."""
-    wanted = [one.root @ one.heights for one in told]
-    N = [one.root @ (one.carry @ basis_matrix(knots, one.uv)) for one in told]
+    P = [one.carry @ basis_matrix(knots, one.uv) for one in told]
+    wanted = [one.sensor_root @ one.heights for one in told]
+    N = [one.sensor_root @ p for one, p in zip(told, P, strict=True)]
     share = np.ones(len(told))
     strays = [_stray(one, knots) for one in told]
     stiff = smoothness(knots) + np.sum([stray.T @ stray for stray in strays], axis=0)
@@ -232,10 +245,10 @@ def solve(told: Sequence[Told], frame: Frame, knots: Knots) -> Joined:
         H = stiff + sum(w * n.T @ n for w, n in zip(share, N, strict=True))
         factor = cho_factor(H)
         c = cho_solve(factor, np.sum([w * n.T @ y for w, n, y in zip(share, N, wanted, strict=True)], axis=0))
-        squares = np.array([np.sum((y - n @ c) ** 2) for n, y in zip(N, wanted, strict=True)])
+        squares = np.array([np.sum((one.root @ (one.heights - p @ c)) ** 2) for one, p in zip(told, P, strict=True)])
         size = np.sqrt(squares / [len(y) for y in wanted])
         share = np.minimum(1.0, ROBUST / np.maximum(size, 1e-12))
-    gains = [w * cho_solve(factor, n.T @ one.root) for w, n, one in zip(share, N, told, strict=True)]
+    gains = [w * cho_solve(factor, n.T @ one.sensor_root) for w, n, one in zip(share, N, told, strict=True)]
     field = HeightField(frame.base, frame.low, frame.high, knots, c.reshape(knots.shape))
     counts = np.array([len(y) for y in wanted])
     loss = np.where(size > ROBUST, counts * (2.0 * size - ROBUST) * ROBUST, squares)

@@ -318,10 +318,14 @@ class TrimLoop:
 
 @dataclass(frozen=True)
 class Crease:
-    """Curve in which two surfaces meet: a polyline (k, 3) in map, which the trim loops of both refer to."""
+    """Curve in which two surfaces meet: a polyline (k, 3) in map, which the trim loops of both refer to.
+
+    corners : numbers in SurfaceMap.corners of its first and its last point, -1 for a free end.
+    """
 
     surfaces: tuple[str, str]
     points: Array
+    corners: tuple[int, int] = (-1, -1)
 
     def __post_init__(self) -> None:
         _check(self, points=(None, 3))
@@ -400,10 +404,17 @@ class Decision:
 
 @dataclass(frozen=True)
 class SurfaceMap:
-    """B-spline surfaces, of data sets (after fit) or of the map (after merge)."""
+    """B-spline surfaces, of data sets (after fit) or of the map (after merge).
+
+    creases : to which the trims of the surfaces refer.  corners : (k, 3) in map, points in which creases end together.
+    """
 
     surfaces: tuple[BSplineSurface, ...]
     data_sets: tuple[DataSet, ...]
     decisions: tuple[Decision, ...] = ()
     notes: dict[str, Any] = field(default_factory=dict)
     creases: tuple[Crease, ...] = ()
+    corners: Array = field(default_factory=lambda: np.zeros((0, 3)))
+
+    def __post_init__(self) -> None:
+        _check(self, corners=(None, 3))

@@ -34,8 +34,10 @@ def face(name, crease):
 
 @pytest.fixture
 def path(tmp_path):
-    crease = Crease(("a", "b"), np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]))
-    write_surfaces(tmp_path / "a.json", SurfaceMap((face("a", 0), face("b", 0)), (), creases=(crease,)))
+    corners = np.array([[0.0, 0.0, 0.0]])
+    crease = Crease(("a", "b"), np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]), (0, -1))
+    faces = face("a", 0), face("b", 0)
+    write_surfaces(tmp_path / "a.json", SurfaceMap(faces, (), creases=(crease,), corners=corners))
     return tmp_path / "a.json"
 
 
@@ -46,6 +48,15 @@ def test_faces_come_back(path):
     np.testing.assert_array_equal(first.trims[0].creases, [0, -1, -1, -1])
     np.testing.assert_allclose(first.covariance.matrix, made.covariance.matrix, rtol=1e-6)
     assert crease.surfaces == ("a", "b")
+    assert crease.corners == (0, -1)
+    np.testing.assert_array_equal(crease.points, [[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
+    np.testing.assert_array_equal(read.corners, [[0.0, 0.0, 0.0]])
+
+
+def test_corners_are_stored_once(path):
+    plain = json.loads(path.read_text())
+    assert plain["corners"] == [[0.0, 0.0, 0.0]]
+    assert plain["creases"][0]["points"] == [[2.0, 0.0, 0.0]]
 
 
 def change(plain, value, *way):
@@ -63,6 +74,9 @@ FIRST = ("surfaces", 0)
         (["a"], ("creases", 0, "surfaces"), r"creases\[0\]: surfaces has 1 names, wanted 2"),
         (["a", "c"], ("creases", 0, "surfaces"), r"creases\[0\]: there is no surface 'c'"),
         ([[0, 0]], ("creases", 0, "points"), r"points is 1 x 2, wanted any x 3"),
+        ([], ("creases", 0, "points"), r"creases\[0\]: has 1 points with its corners, wanted 2 or more"),
+        ([0, 1], ("creases", 0, "corners"), r"corners\[1\] is 1, wanted -1 or a number of a corner"),
+        ([[0, 0]], ("corners",), r"corners is 1 x 2, wanted any x 3"),
         ([[0, 0], [1, 0]], (*FIRST, "trims", 0, "parameters"), "has 2 vertices, wanted 3 or more"),
         ([[0, 0], [1, 0], [1, 1], [0, 1.5]], (*FIRST, "trims", 0, "parameters"), r"lie outside \[0, 1\]"),
         ([0, 0, 1, 0], (*FIRST, "trims", 0, "creases"), r"creases\[2\] is 1, wanted -1 or a number of a crease"),

@@ -42,7 +42,13 @@ def make_map_file(inputs: tuple[Path, ...], output: Path, merge_params: MergePar
 
         merged = merge_surfaces([read_surfaces(path) for path in inputs], merge_params, track=track)
         outcomes = [decision.outcome for decision in merged.decisions]
-        figures = {**map_figures(merged), "merged": outcomes.count("merged"), "refused": outcomes.count("refused")}
+        figures = {
+            **map_figures(merged),
+            "creases": len(merged.creases),
+            "corners": len(merged.corners),
+            "merged": outcomes.count("merged"),
+            "refused": outcomes.count("refused"),
+        }
         return Result([lambda path, provenance: write_surfaces(path, merged, provenance)], figures)
 
     run_stage("merge", list(inputs), [output], [merge_params], compute, force)

@@ -33,7 +33,8 @@ class MalformedError(ValueError):
 
 def parse_map(plain: dict[str, Any]) -> SurfaceMap:
     """Surfaces of a file's JSON object; MalformedError where it does not make sense."""
-    creases = tuple(_crease(c, f"creases[{i}]") for i, c in enumerate(_get(plain, "creases", list, "file")))
+    corners = _points(plain, "corners", "file")
+    creases = tuple(_crease(c, corners, f"creases[{i}]") for i, c in enumerate(_get(plain, "creases", list, "file")))
     surfaces = tuple(
         _surface(s, f"surfaces[{i}]", len(creases)) for i, s in enumerate(_get(plain, "surfaces", list, "file"))
     )
@@ -49,14 +50,25 @@ def parse_map(plain: dict[str, Any]) -> SurfaceMap:
         decisions=tuple(_decision(d, f"decisions[{i}]") for i, d in enumerate(_get(plain, "decisions", list, "file"))),
         notes=_get(plain, "notes", dict, "file"),
         creases=creases,
+        corners=corners,
     )
 
 
-def _crease(plain: Any, where: str) -> Crease:
+def _crease(plain: Any, corners: Array, where: str) -> Crease:
     names = _names(plain, "surfaces", where)
     if len(names) != 2:
         raise MalformedError(f"{where}: surfaces has {len(names)} names, wanted 2")
-    return Crease((names[0], names[1]), _array(plain, "points", (None, 3), where))
+    first, last = _numbers(plain, "corners", 2, len(corners), "corner", where).tolist()
+    ends = [corners[k : k + 1] if k >= 0 else np.zeros((0, 3)) for k in (first, last)]
+    points = np.concatenate([ends[0], _points(plain, "points", where), ends[1]])
+    if len(points) < 2:
+        raise MalformedError(f"{where}: has {len(points)} points with its corners, wanted 2 or more")
+    return Crease((names[0], names[1]), points, (first, last))
+
+
+def _points(plain: Any, key: str, where: str) -> Array:
+    """Points (n, 3) of a key, which can be none."""
+    return np.zeros((0, 3)) if _get(plain, key, list, where) == [] else _array(plain, key, (None, 3), where)
 
 
 def _surface(plain: Any, where: str, creases: int) -> BSplineSurface:
@@ -87,14 +99,15 @@ def _loop(plain: Any, creases: int, where: str) -> TrimLoop:
         raise MalformedError(f"{where}: parameters has {len(parameters)} vertices, wanted 3 or more")
     if np.any((parameters < 0.0) | (parameters > 1.0)):
         raise MalformedError(f"{where}: parameters lie outside [0, 1]")
-    return TrimLoop(parameters, _crease_numbers(plain, len(parameters), creases, where))
+    return TrimLoop(parameters, _numbers(plain, "creases", len(parameters), creases, "crease", where))
 
 
-def _crease_numbers(plain: Any, count: int, creases: int, where: str) -> IntArray:
-    numbers = _array(plain, "creases", (count,), where)
-    bad = np.flatnonzero((numbers != np.rint(numbers)) | (numbers < -1) | (numbers >= creases))
+def _numbers(plain: Any, key: str, count: int, limit: int, what: str, where: str) -> IntArray:
+    """(count,) numbers of things of which there are `limit`, or -1."""
+    numbers = _array(plain, key, (count,), where)
+    bad = np.flatnonzero((numbers != np.rint(numbers)) | (numbers < -1) | (numbers >= limit))
     if len(bad):
-        raise MalformedError(f"{where}: creases[{bad[0]}] is {numbers[bad[0]]:g}, wanted -1 or a number of a crease")
+        raise MalformedError(f"{where}: {key}[{bad[0]}] is {numbers[bad[0]]:g}, wanted -1 or a number of a {what}")
     return numbers.astype(np.int64)
 
 

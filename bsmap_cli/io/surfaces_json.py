@@ -1,11 +1,13 @@
 """The artifact of `fit` and `merge`: B-spline surfaces as JSON (.surfaces.json, .map.json; .gz by name).
 
-    {"format": "bsmap-surfaces", "version": 2, "units": "metres, radians, frame map",
+    {"format": "bsmap-surfaces", "version": 3, "units": "metres, radians, frame map",
      "bsmap-provenance": {...},
      "data_sets": [{"name", "movement": "translation" | "rotation", "first_scan", "last_scan", "points"}, ...],
      "surfaces": [surface, ...],
      "decisions": [{"first", "second", "outcome": "merged" | "refused", "reason", "figures": {...}}, ...],
-     "creases": [{"surfaces": [name, name], "points": k x 3 polyline}, ...],
+     "corners": k x 3 points in which creases end together,
+     "creases": [{"surfaces": [name, name], "corners": [first, last], "points": k x 3 polyline}, ...],
+                             corners: their numbers, -1 for a free end; corners are not among the points
      "notes": {...}}
 
     surface = {"name", "data_sets": [names],
@@ -25,9 +27,9 @@
      "residuals": {"points", "mean", "rms", "percentile_95", "maximum"}}
 
 model.py tells what each of them means. Numbers are rounded to what they are worth, for the bytes of a map matter:
-coordinates and correlations to 1e-6, knots to 1e-10, creases and parameters of trims to 1e-5, covariances to 4 (those
-of heights, which are differences of large numbers, to 7) and residuals to 6 significant digits. A map that was read is
-written again byte for byte.
+coordinates and correlations to 1e-6, knots to 1e-10, creases, corners and parameters of trims to 1e-5, covariances to
+4 (those of heights, which are differences of large numbers, to 7) and residuals to 6 significant digits. A map that was
+read is written again byte for byte.
 """
 
 import gzip
@@ -54,7 +56,7 @@ from bsmap_cli.model import (
 )
 
 FORMAT = "bsmap-surfaces"
-VERSION = 2
+VERSION = 3
 
 
 def write_surfaces(path: Path | str, surfaces: SurfaceMap, provenance: Provenance | None = None) -> None:
@@ -75,6 +77,7 @@ def write_surfaces(path: Path | str, surfaces: SurfaceMap, provenance: Provenanc
         _list("data_sets", [plain_json(asdict(data_set)) for data_set in surfaces.data_sets]),
         _list("surfaces", [_surface(surface) for surface in surfaces.surfaces]),
         _list("decisions", [plain_json(asdict(decision)) for decision in surfaces.decisions]),
+        _list("corners", _rounded(surfaces.corners, 5)),
         _list("creases", [_crease(crease) for crease in surfaces.creases]),
         f'"notes":{_dumps(plain_json(surfaces.notes))}',
     ]
@@ -114,7 +117,13 @@ def _loop(loop: TrimLoop) -> dict[str, Any]:
 
 
 def _crease(crease: Crease) -> dict[str, Any]:
-    return {"surfaces": list(crease.surfaces), "points": _rounded(crease.points, 5)}
+    first, last = (corner >= 0 for corner in crease.corners)
+    points = crease.points[int(first) : len(crease.points) - int(last)]
+    return {
+        "surfaces": list(crease.surfaces),
+        "corners": [int(corner) for corner in crease.corners],
+        "points": _rounded(points, 5),
+    }
 
 
 def _covariance(covariance: SurfaceCovariance | HeightCovariance) -> dict[str, Any]:

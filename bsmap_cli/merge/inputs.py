@@ -4,6 +4,8 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from bsmap_cli.model import BSplineSurface, Crease, HeightCovariance, SurfaceMap, TrimLoop
 
 
@@ -18,12 +20,21 @@ def unite(maps: Sequence[SurfaceMap]) -> SurfaceMap:
         maps = [_prefixed(m, f"{number}.") for number, m in enumerate(maps, start=1)]
     surfaces: list[BSplineSurface] = []
     creases: list[Crease] = []
+    corners = 0
     for m in maps:
         surfaces += [_renumbered(surface, len(creases)) for surface in m.surfaces]
-        creases += m.creases
+        creases += [_with_corners_from(crease, corners) for crease in m.creases]
+        corners += len(m.corners)
     data_sets = tuple(data_set for m in maps for data_set in m.data_sets)
     decisions = tuple(decision for m in maps for decision in m.decisions)
-    return SurfaceMap(tuple(surfaces), data_sets, decisions, {}, tuple(creases))
+    of_all = np.concatenate([m.corners for m in maps])
+    return SurfaceMap(tuple(surfaces), data_sets, decisions, {}, tuple(creases), of_all)
+
+
+def _with_corners_from(crease: Crease, start: int) -> Crease:
+    """The crease, its corners counted from `start`."""
+    first, last = (corner + start if corner >= 0 else -1 for corner in crease.corners)
+    return replace(crease, corners=(first, last))
 
 
 def _renumbered(surface: BSplineSurface, first: int) -> BSplineSurface:

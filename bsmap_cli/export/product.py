@@ -8,7 +8,7 @@ from bsmap_cli.errors import BadInputError, ParameterError
 from bsmap_cli.export.meshes import WRITERS, NamedMesh
 from bsmap_cli.export.nurbs_json import write_nurbs_json
 from bsmap_cli.export.orientation import turn_to_sensor, viewpoints
-from bsmap_cli.export.tessellation import tessellate
+from bsmap_cli.export.tessellation import tessellate_map
 from bsmap_cli.model import SurfaceMap
 from bsmap_cli.params import ExportParams
 from bsmap_cli.track import Track, silent
@@ -66,11 +66,9 @@ def export_map(
 def make_meshes(surface_map: SurfaceMap, tolerance: float, *, track: Track = silent) -> list[NamedMesh]:
     """Triangles of every surface, within `tolerance` metres of it, their front towards the sensor."""
     seen_from = viewpoints(surface_map)
-    meshes = []
-    for done, surface in enumerate(surface_map.surfaces):
-        track("surfaces", done, len(surface_map.surfaces))
-        mesh = turn_to_sensor(tessellate(surface, tolerance), surface.covariance.pose, seen_from)
-        if len(mesh.triangles):
-            meshes.append(NamedMesh(surface.name, mesh))
-    track("surfaces", len(surface_map.surfaces), len(surface_map.surfaces))
-    return meshes
+    made = tessellate_map(surface_map, tolerance, track=track)
+    return [
+        NamedMesh(surface.name, turn_to_sensor(mesh, surface.covariance.pose, seen_from))
+        for surface, mesh in zip(surface_map.surfaces, made, strict=True)
+        if len(mesh.triangles)
+    ]

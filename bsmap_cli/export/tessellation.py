@@ -7,24 +7,28 @@ triangle with legs a and b along u and v its distance to the surface is at most 
     1/8 (a^2 max|S_uu| + 2 a b max|S_uv| + b^2 max|S_vv|),
 
 and the control points of S_uu, S_uv, S_vv bound these (convex hull). The bound tells where to divide; what distance is
-left is measured. Neighbouring surfaces are divided each on its own:
-where they share an edge, the two rows of triangles meet within the tolerance, not point by point.
+left is measured. Surfaces that meet in a crease of the map have its points there, both the same.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
-from bsmap_cli.core.bspline import Surface, evaluate_grid, evaluate_surface
+from bsmap_cli.core.bspline import Surface, evaluate_grid
 from bsmap_cli.errors import ParameterError
+from bsmap_cli.export.borders import Border, borders
 from bsmap_cli.export.trimmed import triangulate
-from bsmap_cli.model import Array, BSplineSurface, IntArray
+from bsmap_cli.model import Array, BSplineSurface, IntArray, SurfaceMap
+from bsmap_cli.track import Track, silent
 
 MOST_POINTS = 10_000_000
 """Points of one surface; beyond it a tolerance is refused, for no viewer shows the mesh and memory runs out."""
 
 MARGIN = 1.25
 """On measured distances, for what lies between the points of measurement."""
+
+SPANNED = 1.5
+"""Steps of the grid that triangles between the grid and a trimmed border span; the distance grows with the square."""
 
 SLIVER = 1e-9
 """Metres; a triangle less high than this is dropped (where the edge of a surface shrinks to a point)."""
@@ -55,12 +59,35 @@ def tessellate(surface: BSplineSurface, tolerance: float) -> Mesh:
     ParameterError
         The tolerance asks for more than `MOST_POINTS` points.
     """
-    u, v = grid_parameters(surface, tolerance)
+    grid = _grid(surface, tolerance)
+    return _mesh(surface, grid, borders([surface], [], [_longest_steps(grid)])[0])
+
+
+def tessellate_map(surface_map: SurfaceMap, tolerance: float, *, track: Track = silent) -> list[Mesh]:
+    """Meshes of all surfaces as of `tessellate`; along creases both surfaces have the very same vertices."""
+    surfaces = surface_map.surfaces
+    grids = []
+    for done, surface in enumerate(surfaces):
+        track("surfaces", done, len(surfaces))
+        grids.append(_grid(surface, tolerance))
+    found = borders(surfaces, surface_map.creases, [_longest_steps(grid) for grid in grids])
+    track("surfaces", len(surfaces), len(surfaces))
+    return [_mesh(*each) for each in zip(surfaces, grids, found, strict=True)]
+
+
+def _grid(surface: BSplineSurface, tolerance: float) -> tuple[Array, Array]:
+    return grid_parameters(surface, tolerance / SPANNED**2 if surface.trims else tolerance)
+
+
+def _longest_steps(grid: tuple[Array, Array]) -> Array:
+    return np.array([np.diff(parameters).max() for parameters in grid])
+
+
+def _mesh(surface: BSplineSurface, grid: tuple[Array, Array], border: list[Border]) -> Mesh:
     if surface.trims:
-        parameters, triangles = triangulate(surface, u, v)
-        return _without_slivers(evaluate_surface(surface, *parameters.T), triangles)
-    points = evaluate_grid(surface, u, v)
-    return _without_slivers(points.reshape(-1, 3), _grid_triangles(len(u), len(v)))
+        return _without_slivers(*triangulate(surface, border, *grid))
+    points = evaluate_grid(surface, *grid)
+    return _without_slivers(points.reshape(-1, 3), _grid_triangles(len(grid[0]), len(grid[1])))
 
 
 def grid_parameters(surface: BSplineSurface, tolerance: float) -> tuple[Array, Array]:

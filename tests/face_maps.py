@@ -111,3 +111,61 @@ def map_of(*surfaces, creases=()):
     return SurfaceMap(
         surfaces, tuple(DataSet(name, "translation", 0, 20, 1000) for name in names), creases=tuple(creases)
     )
+
+
+def plate(name, origin, along_u, along_v, sensor, creases=(-1, -1, -1, -1)):
+    """Flat face origin + u along_u + v along_v, seen from `sensor` (2,); creases along v = 0, u = 1, v = 1, u = 0."""
+    origin, along_u, along_v = (np.asarray(a, dtype=float) for a in (origin, along_u, along_v))
+    net = np.array([[origin + u * along_u + v * along_v for v in (0, 1)] for u in (0, 1)])
+    normal = np.cross(along_u, along_v)
+    data_set = name.split("/")[0]
+    return BSplineSurface(
+        name,
+        (data_set,),
+        1,
+        1,
+        FLAT,
+        FLAT,
+        net,
+        HeightCovariance(
+            (normal / np.linalg.norm(normal))[None, None],
+            SIGMA**2 * np.eye(4),
+            (PosePart(data_set, np.asarray(sensor, dtype=float), np.zeros((3, 3))),),
+        ),
+        Residuals(1000, 0.008, 0.01, 0.02, 0.03),
+        (TrimLoop(box((0.0, 0.0), (1.0, 1.0)), np.array(creases)),),
+    )
+
+
+SIDES = {
+    "floor": ("000", "100", "110", "010"),
+    "ceiling": ("001", "101", "111", "011"),
+    "south": ("000", "100", "101", "001"),
+    "north": ("010", "110", "111", "011"),
+    "west": ("000", "010", "011", "001"),
+    "east": ("100", "110", "111", "101"),
+}
+"""Corners of the sides of a box, in the order of a plate's: x, y, z low (0) or high (1)."""
+
+
+def boxed(data_set, low, high, sides=tuple(SIDES)):
+    """Map of the inside of a box, as one data set sees it: some of its sides, with creases between those."""
+    low, high = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
+    at = {f"{i}{j}{k}": np.where([i, j, k], high, low) for i in (0, 1) for j in (0, 1) for k in (0, 1)}
+    edges, plates = {}, []
+    for side in sides:
+        ring = SIDES[side]
+        for start, end in zip(ring, ring[1:] + ring[:1], strict=True):
+            edges.setdefault(tuple(sorted((start, end))), []).append(side)
+    shared = [edge for edge, two in edges.items() if len(two) == 2]
+    for side in sides:
+        ring = SIDES[side]
+        pairs = [tuple(sorted(pair)) for pair in zip(ring, ring[1:] + ring[:1], strict=True)]
+        marks = [shared.index(pair) if pair in shared else -1 for pair in pairs]
+        origin, u, v = at[ring[0]], at[ring[1]] - at[ring[0]], at[ring[3]] - at[ring[0]]
+        plates.append(plate(f"{data_set}/{side}", origin, u, v, (low + high)[:2] / 2, marks))
+    lines = [
+        Crease(tuple(f"{data_set}/{side}" for side in edges[edge]), np.array([at[edge[0]], at[edge[1]]]))
+        for edge in shared
+    ]
+    return map_of(*plates, creases=lines)

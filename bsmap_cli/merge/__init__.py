@@ -72,7 +72,9 @@ def merge_surfaces(maps: Sequence[SurfaceMap], params: MergeParams, *, track: Tr
     merged = tuple(patch.surface for patch in search.patches.values())
     decisions = (*united.decisions, *faces.decisions, *search.decisions)
     surfaces_of_map = (*merged, *faces.surfaces)
-    return SurfaceMap(surfaces_of_map, united.data_sets, decisions, notes | faces.notes, tuple(faces.creases))
+    return SurfaceMap(
+        surfaces_of_map, united.data_sets, decisions, notes | faces.notes, tuple(faces.creases), faces.corners
+    )
 
 
 def _test(search: _Search, pairs: Iterable[tuple[int, int]]) -> None:

@@ -1,6 +1,6 @@
 """Trimmed faces of data sets -> faces of the map, every physical face once."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -12,19 +12,14 @@ from bsmap_cli.fit.selection import Fitted
 from bsmap_cli.fit.surfaces import spline_of
 from bsmap_cli.merge.adjustment import Correction, adjust, moved, moved_crease, with_left_over
 from bsmap_cli.merge.association import associate
+from bsmap_cli.merge.curves import FacePair, onto, straight
+from bsmap_cli.merge.extent import trimmed
 from bsmap_cli.merge.information import Frame, Joined, Told, common_frame, covariance_of, join, tell
-from bsmap_cli.merge.outlines import (
-    FacePair,
-    crease_of,
-    joints,
-    member_of,
-    onto,
-    outline,
-    straight,
-    trims_of,
-)
+from bsmap_cli.merge.outlines import creased_sides, member_of, outline, snapped
 from bsmap_cli.merge.planar import PlanarFace, is_planar, planar_face
+from bsmap_cli.merge.topology import Topology, find_topology
 from bsmap_cli.model import (
+    Array,
     BSplineSurface,
     Crease,
     Decision,
@@ -37,17 +32,18 @@ from bsmap_cli.track import Track, silent
 
 
 class MergedFaces(NamedTuple):
-    """Faces of the map, their creases, what was decided, and figures for the notes."""
+    """Faces of the map, their creases and corners (k, 3), what was decided, and figures for the notes."""
 
     surfaces: list[BSplineSurface]
     creases: list[Crease]
+    corners: Array
     decisions: list[Decision]
     notes: dict[str, float]
 
 
 def no_faces() -> MergedFaces:
     """Of a map without trimmed surfaces."""
-    return MergedFaces([], [], [], {})
+    return MergedFaces([], [], np.zeros((0, 3)), [], {})
 
 
 class _Group(NamedTuple):
@@ -92,13 +88,13 @@ def merge_faces(
     planar = {face.surface.name for face in faces}
     others = [surface for surface in surfaces if surface.name not in planar]
     track("merging faces", 2, 2)
-    made, lines = _assemble(groups, others, creases, params)
+    made, lines, corners = _assemble(groups, others, creases, params)
     notes = {
         "faces_before": float(len(surfaces)),
         "faces_after": float(len(made)),
         "largest_correction": _largest(corrections),
     }
-    return MergedFaces(made, lines, [*decisions, *_left(others)], notes)
+    return MergedFaces(made, lines, corners, [*decisions, *_left(others)], notes)
 
 
 def _key(surface: BSplineSurface) -> tuple[float, ...]:
@@ -132,25 +128,32 @@ def _groups(faces: Sequence[PlanarFace], numbers: Sequence[Sequence[int]], param
 
 def _assemble(
     groups: Sequence[_Group], others: Sequence[BSplineSurface], creases: Sequence[Crease], params: MergeParams
-) -> tuple[list[BSplineSurface], list[Crease]]:
-    """Surfaces and creases of the map."""
+) -> tuple[list[BSplineSurface], list[Crease], Array]:
+    """Surfaces, creases and corners of the map."""
     fields = {number: group.field for number, group in enumerate(groups)}
     number_of = {face.surface.name: number for number, group in enumerate(groups) for face in group.faces}
     number_of |= {surface.name: len(groups) + k for k, surface in enumerate(others)}
     names = _names(groups, others)
     pairs = [_pair(crease, number_of, fields) for crease in creases]
+    members = [
+        [snapped(member_of(face.surface, pairs), number, fields) for face in group.faces]
+        for number, group in enumerate(groups)
+    ]
     outlines = {}
     for number, group in enumerate(groups):
-        members = [member_of(face.surface, pairs) for face in group.faces]
         sets = [" ".join(face.surface.data_sets) for face in group.faces]
-        outlines[number] = outline(members, sets, fields[number], number, fields, params.gap)
-    outlines = {number: found for number, found in outlines.items() if found.loops}
-    found = joints(outlines, fields)
+        if loops := outline(members[number], sets, fields[number], params.gap):
+            outlines[number] = loops
+    sides = creased_sides(member for some in members for member in some)
+    found = find_topology(outlines, sides, fields, params.gap)
     made = [
-        replace(_surface(groups[number], names[number]), trims=trims_of(lines, found, fields[number]))
-        for number, lines in outlines.items()
+        trimmed(_surface(groups[number], names[number]), rings, fields[number]) for number, rings in found.rings.items()
     ]
-    return [*made, *(_without_creases(surface) for surface in others)], [crease_of(joint, names) for joint in found]
+    return [*made, *(_without_creases(surface) for surface in others)], _creases(found, names), found.corners
+
+
+def _creases(found: Topology, names: Mapping[int, str]) -> list[Crease]:
+    return [Crease((names[e.pair[0]], names[e.pair[1]]), e.points, e.corners) for e in found.edges]
 
 
 def _pair(crease: Crease, number_of: dict[str, int], fields: dict[int, HeightField]) -> FacePair | None:

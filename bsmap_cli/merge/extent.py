@@ -1,0 +1,56 @@
+"""Surfaces over a plane that reach as far as their outlines: corners may lie beyond a surface's own rectangle."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from bsmap_cli.core.bspline import clamped_knots, design_matrix, inner_knots
+from bsmap_cli.fit.heights import HeightField, greville
+from bsmap_cli.merge.regions import GRID
+from bsmap_cli.merge.topology import Ring
+from bsmap_cli.model import Array, BSplineSurface, HeightCovariance, TrimLoop
+
+
+def trimmed(surface: BSplineSurface, rings: Sequence[Ring], field: HeightField) -> BSplineSurface:
+    """The surface with these outlines, extended where they lie beyond it.  field : that of the surface."""
+    found = [field.parameters(field.base.local(ring.points)) for ring in rings]
+    low = np.minimum(np.min([uv.min(axis=0) for uv in found], axis=0), 0.0)
+    high = np.maximum(np.max([uv.max(axis=0) for uv in found], axis=0), 1.0)
+    beyond = np.maximum(-low, high - 1.0) * (field.high - field.low)
+    if beyond.max() > 2.0 * GRID:
+        surface = extended(surface, low, high)
+    else:
+        low, high = np.zeros(2), np.ones(2)
+    inside = (np.clip((uv - low) / (high - low), 0.0, 1.0) for uv in found)
+    loops = (TrimLoop(uv, ring.edges) for uv, ring in zip(inside, rings, strict=True))
+    return replace(surface, trims=tuple(loops))
+
+
+def extended(surface: BSplineSurface, low: Array, high: Array) -> BSplineSurface:
+    """The same surface over the parameters from `low` (2,) <= 0 to `high` (2,) >= 1, without its trims.
+
+    Its outer polynomials go on; the new control points are linear in the old ones, and so is their covariance.
+    """
+    assert isinstance(surface.covariance, HeightCovariance)
+    knots_u, by_u = _carry(surface.knots_u, surface.degree_u, low[0], high[0])
+    knots_v, by_v = _carry(surface.knots_v, surface.degree_v, low[1], high[1])
+    both = np.kron(by_u, by_v)
+    matrix = both @ surface.covariance.matrix @ both.T
+    return replace(
+        surface,
+        knots_u=knots_u,
+        knots_v=knots_v,
+        control_points=np.einsum("ai,bj,ijd->abd", by_u, by_v, surface.control_points),
+        covariance=replace(surface.covariance, matrix=(matrix + matrix.T) / 2.0),
+        trims=(),
+    )
+
+
+def _carry(knots: Array, degree: int, low: float, high: float) -> tuple[Array, Array]:
+    """Knots over [low, high] brought to [0, 1], and the matrix (n, n) from old to new control points."""
+    new = clamped_knots(degree, (inner_knots(knots, degree) - low) / (high - low))
+    at = greville(knots, degree)
+    # Splines on the same inner knots are the same functions: equal at as many places as there are control points.
+    basis = design_matrix(new, degree, (at - low) / (high - low))
+    return new, np.asarray(np.linalg.solve(basis, design_matrix(knots, degree, at)), dtype=np.float64)

@@ -1,0 +1,151 @@
+"""Runs of the outlines of faces along the curves in which they meet others, and the corners between two runs."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from bsmap_cli.merge.curves import APART, Curve, Fields, covered, locate, onto, place
+from bsmap_cli.model import Array, IntArray
+
+BESIDE = 0.01
+"""Metres from a curve within which an outline runs along it."""
+OFF = 0.005
+"""Metres from a corner to the curves that end there."""
+KNOWN = 0.5
+"""Metres that a run may be away from a corner where the other face's outline runs on along the curve. Scans of a
+rotation lie 40 cm apart at the walls; floor and ceiling then lack the cells in corners to which the walls reach."""
+
+
+class Run(NamedTuple):
+    """Part of a loop along a curve: from vertex `first` to vertex `last`, at the lengths `start` and `end`."""
+
+    curve: int
+    first: int
+    last: int
+    start: float
+    end: float
+
+    @property
+    def sign(self) -> int:
+        """+1 where it runs as the curve does, else -1."""
+        return 1 if self.end > self.start else -1
+
+
+class Meeting(NamedTuple):
+    """Where a run of a loop ends and the next one begins: the faces that meet there, and the point (3,)."""
+
+    run: int
+    following: int
+    faces: tuple[int, ...]
+    point: Array
+
+
+def find_runs(loop: Array, curves: Mapping[int, Curve], gap: float) -> list[Run]:
+    """Runs of a loop (k, 3) in its order.
+
+    Parameters
+    ----------
+    curves : those of its face under their numbers.
+    gap : metres; a loop that leaves a curve by less than half of it, for less than twice of it, runs on along it.
+    """
+    numbers, forward = _sides(loop, curves, gap)
+    key = np.where(numbers >= 0, 2 * numbers + forward, -1)
+    starts = np.flatnonzero(key != np.roll(key, 1))
+    runs = []
+    for start, stop in zip(starts.tolist(), np.roll(starts, -1).tolist(), strict=True):
+        if key[start] >= 0:
+            t = locate(curves[int(numbers[start])], loop[[start, stop]])[0]
+            runs.append(Run(int(numbers[start]), start, stop, float(t[0]), float(t[1])))
+    return _joined([run for run in runs if abs(run.end - run.start) > APART], loop, curves, gap)
+
+
+def _sides(loop: Array, curves: Mapping[int, Curve], gap: float) -> tuple[IntArray, IntArray]:
+    """Of each side (k,) the nearest curve that it runs along, -1 for none; and 1 where it runs as the curve does."""
+    length = np.linalg.norm(np.roll(loop, -1, axis=0) - loop, axis=1)
+    best, number, forward = np.full(len(loop), np.inf), np.full(len(loop), -1), np.zeros(len(loop), dtype=np.int64)
+    for k, curve in sorted(curves.items()):
+        t, off = locate(curve, loop)
+        t, off = np.stack([t, np.roll(t, -1)]), np.maximum(off, np.roll(off, -1))
+        low, high = t.min(axis=0)[:, None], t.max(axis=0)[:, None]
+        seen = np.any((curve.seen[:, 0] < high + gap) & (curve.seen[:, 1] > low - gap), axis=1)
+        along = (off < BESIDE) & (off < best) & (np.abs(t[1] - t[0]) > 0.5 * length) & seen
+        best[along], number[along], forward[along] = off[along], k, t[1, along] > t[0, along]
+    return number, forward
+
+
+def _joined(runs: list[Run], loop: Array, curves: Mapping[int, Curve], gap: float) -> list[Run]:
+    """The runs, those joined between which the loop leaves their curve little."""
+    k = 0
+    while k < len(runs) and len(runs) > 1:
+        following = (k + 1) % len(runs)
+        one, other = runs[k], runs[following]
+        if _runs_on(one, other, loop, curves[one.curve], gap):
+            whole = Run(one.curve, one.first, other.last, one.start, other.end)
+            runs = [whole, *runs[1:-1]] if following == 0 else [*runs[:k], whole, *runs[k + 2 :]]
+            k = max(k - 1, 0) if following else 0
+        else:
+            k += 1
+    return runs
+
+
+def _runs_on(one: Run, other: Run, loop: Array, curve: Curve, gap: float) -> bool:
+    if (one.curve, one.sign) != (other.curve, other.sign) or abs(other.start - one.end) > 2.0 * gap:
+        return False
+    if (other.end - one.start) * one.sign <= 0.0:
+        return False
+    off = locate(curve, open_part(loop, one.last, other.first))[1]
+    return bool(off.max(initial=0.0) < gap / 2.0)
+
+
+def open_part(loop: Array, first: int, last: int) -> Array:
+    """Vertices (k, 3) of a loop from `first` to `last`, both among them."""
+    return loop[np.arange(first, last + 1 if last >= first else last + 1 + len(loop)) % len(loop)]
+
+
+def find_meetings(
+    loop: Array,
+    runs: Sequence[Run],
+    curves: Mapping[int, Curve],
+    others: Mapping[int, Array],
+    fields: Fields,
+    gap: float,
+) -> list[Meeting]:
+    """Where runs of a loop that follow each other meet, as far as what lies between them is little or known.
+
+    others : (k, 2) lengths along each curve between which the other face runs along it.
+    """
+    out = []
+    for k, one in enumerate(runs):
+        following = (k + 1) % len(runs)
+        other = runs[following]
+        if one.curve == other.curve:
+            continue
+        faces = tuple(sorted({*curves[one.curve].pair, *curves[other.curve].pair}))
+        way = open_part(loop, one.last, other.first)
+        ends = np.concatenate(
+            [place(curves[r.curve], np.array([t]), fields) for r, t in ((one, one.end), (other, other.start))]
+        )
+        point = onto([fields[face] for face in faces], ends.mean(axis=0)[None], KNOWN)
+        reach = np.linalg.norm(ends - point, axis=1).max() + gap / 2.0
+        if np.linalg.norm(way - point, axis=1).max() > reach:
+            continue
+        missing = _missing(one, True, curves[one.curve], point), _missing(other, False, curves[other.curve], point)
+        if all(
+            part is not None and _small(part, others[r.curve], gap)
+            for part, r in zip(missing, (one, other), strict=True)
+        ):
+            out.append(Meeting(k, following, faces, point[0]))
+    return out
+
+
+def _missing(run: Run, at_end: bool, curve: Curve, point: Array) -> tuple[float, float] | None:
+    """Lengths along the curve from the end, or the start, of a run to a corner (1, 3); None if that is not on it."""
+    t, off = (float(value[0]) for value in locate(curve, point))
+    return (run.end if at_end else run.start, t) if off < OFF else None
+
+
+def _small(missing: tuple[float, float], other: Array, gap: float) -> bool:
+    """Whether what lies between an end of a run and a corner is short, or the other face runs along it."""
+    low, high = sorted(missing)
+    return high - low < (KNOWN if covered(other, low, high, gap) else 2.0 * gap)

@@ -1,0 +1,237 @@
+"""Faces, creases and corners as one: every crease a curve that both of its faces have, every corner one point.
+
+Outlines of faces run along the curves in which the faces meet. Where one run ends and the next begins is a corner; what
+both faces of a curve run along, between two corners or free ends, is a crease. The outlines are put together again
+from the creases and from what is open. A crease that ends inside another one divides it, for edges meet in corners.
+"""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from bsmap_cli.merge.curves import Curve, FacePair, Fields, between, curves_of, locate, onto, place
+from bsmap_cli.merge.runs import OFF, Meeting, Run, find_meetings, find_runs, open_part
+from bsmap_cli.model import Array, IntArray
+
+SAME = 0.01
+"""Metres between two corners, or two ends of runs, that are one."""
+
+
+class Edge(NamedTuple):
+    """A crease of the map: its faces, its points (k, 3), the numbers of its corners or -1."""
+
+    pair: FacePair
+    points: Array
+    corners: tuple[int, int]
+
+
+class Ring(NamedTuple):
+    """Loop of a face: points (k, 3) on it, and the number of the edge (k,) from each to the next one, or -1."""
+
+    points: Array
+    edges: IntArray
+
+
+class Topology(NamedTuple):
+    """Rings of each face, edges between them, corners (k, 3)."""
+
+    rings: dict[int, list[Ring]]
+    edges: list[Edge]
+    corners: Array
+
+
+class _Loop(NamedTuple):
+    """A loop of a face: its points (k, 3), its runs, where they meet, and the corners (r, 2) of their ends or -1."""
+
+    face: int
+    points: Array
+    runs: list[Run]
+    meetings: list[Meeting]
+    corners: IntArray
+
+
+class _Corners(NamedTuple):
+    """points (k, 3), and the faces of each."""
+
+    points: Array
+    faces: list[set[int]]
+
+    def on(self, curve: Curve) -> tuple[IntArray, Array]:
+        """Numbers (n,) of the corners on a curve, and their lengths (n,) along it."""
+        mine = np.array([k for k, faces in enumerate(self.faces) if set(curve.pair) <= faces], dtype=np.int64)
+        t, off = locate(curve, self.points[mine])
+        return mine[off < OFF], t[off < OFF]
+
+
+class _Knots(NamedTuple):
+    """Places at which a curve is divided: ascending lengths t (k,), corners (k,) or -1, points (k, 3)."""
+
+    t: Array
+    corners: IntArray
+    points: Array
+
+    def at(self, t: float, corner: int) -> int:
+        """The knot of the end of a run."""
+        return int(np.flatnonzero(self.corners == corner)[0] if corner >= 0 else np.argmin(np.abs(self.t - t)))
+
+
+def find_topology(
+    outlines: Mapping[int, Sequence[Array]], sides: Mapping[FacePair, Array], fields: Fields, gap: float
+) -> Topology:
+    """Edges and corners of the map, and the outlines that refer to them.
+
+    Parameters
+    ----------
+    outlines : of each face its loops (k, 3), on its surface.
+    sides : (k, 2, 3) segments of the creases of data sets, by the faces of the map that meet in them.
+    gap : metres of open border between the end of a crease and a corner that are closed.
+    """
+    curves = curves_of({pair: ends for pair, ends in sides.items() if set(pair) <= outlines.keys()}, fields)
+    loops = _find_loops(outlines, curves, fields, gap)
+    corners = _find_corners(loops, fields)
+    _end_near_corners(loops, curves, corners, gap)
+    knots = [_find_knots(number, curve, loops, corners, fields) for number, curve in enumerate(curves)]
+    edges, number_of = _find_edges(curves, knots, loops)
+    rings: dict[int, list[Ring]] = {face: [] for face in outlines}
+    for loop in loops:
+        rings[loop.face].append(_ring(loop, curves, knots, edges, number_of))
+    return Topology(rings, edges, corners.points)
+
+
+def _find_loops(
+    outlines: Mapping[int, Sequence[Array]], curves: Sequence[Curve], fields: Fields, gap: float
+) -> list[_Loop]:
+    """All loops with their runs and where these meet."""
+    found, spans = [], defaultdict(list)
+    for face in sorted(outlines):
+        mine = {k: curve for k, curve in enumerate(curves) if face in curve.pair}
+        for points in outlines[face]:
+            runs = find_runs(points, mine, gap)
+            found.append((face, points, runs, mine))
+            for run in runs:
+                spans[face, run.curve].append(sorted((run.start, run.end)))
+    loops = []
+    for face, points, runs, mine in found:
+        others = {k: np.array(spans[sum(curve.pair) - face, k]).reshape(-1, 2) for k, curve in mine.items()}
+        meetings = find_meetings(points, runs, mine, others, fields, gap)
+        loops.append(_Loop(face, points, runs, meetings, np.full((len(runs), 2), -1)))
+    return loops
+
+
+def _find_corners(loops: Sequence[_Loop], fields: Fields) -> _Corners:
+    """Corners of all meetings, those nearby being one; the runs' ends get their numbers."""
+    meetings = [(loop, meeting) for loop in loops for meeting in loop.meetings]
+    points = np.array([meeting.point for _, meeting in meetings]).reshape(-1, 3)
+    near = cKDTree(points).query_pairs(SAME, output_type="ndarray") if len(points) else np.zeros((0, 2), dtype=int)
+    n = len(points)
+    label = connected_components(coo_array((np.ones(len(near)), near.T), shape=(n, n)), directed=False)[1]
+    faces: list[set[int]] = [set() for _ in range(label.max(initial=-1) + 1)]
+    for (loop, meeting), corner in zip(meetings, label.tolist(), strict=True):
+        faces[corner] |= set(meeting.faces)
+        loop.corners[meeting.run, 1] = loop.corners[meeting.following, 0] = corner
+    placed = [
+        onto([fields[face] for face in sorted(some)], points[label == corner].mean(axis=0)[None])[0]
+        for corner, some in enumerate(faces)
+    ]
+    return _Corners(np.array(placed).reshape(-1, 3), faces)
+
+
+def _end_near_corners(loops: Sequence[_Loop], curves: Sequence[Curve], corners: _Corners, gap: float) -> None:
+    """Ends of runs that miss a corner of their curve by little get its number."""
+    on = [corners.on(curve) for curve in curves]
+    for loop in loops:
+        for k, run in enumerate(loop.runs):
+            numbers, t = on[run.curve]
+            for side, end in enumerate((run.start, run.end)):
+                if loop.corners[k, side] < 0 and len(t):
+                    nearest = int(np.argmin(np.abs(t - end)))
+                    if abs(t[nearest] - end) < gap:
+                        loop.corners[k, side] = numbers[nearest]
+
+
+def _find_knots(number: int, curve: Curve, loops: Sequence[_Loop], corners: _Corners, fields: Fields) -> _Knots:
+    """Of one curve: corners in which runs end, or that lie on it, and free ends, those nearby being one."""
+    ends = [
+        (t, int(loop.corners[k, side]))
+        for loop in loops
+        for k, run in enumerate(loop.runs)
+        if run.curve == number
+        for side, t in enumerate((run.start, run.end))
+    ]
+    numbers = sorted({corner for _, corner in ends if corner >= 0} | set(corners.on(curve)[0].tolist()))
+    points = corners.points[numbers]
+    t = locate(curve, points)[0] if numbers else np.zeros(0)
+    free = np.sort([end for end, corner in ends if corner < 0])
+    free = free[np.all(np.abs(free[:, None] - t) > SAME, axis=1)]
+    parts = np.split(free, np.flatnonzero(np.diff(free) > SAME) + 1) if len(free) else []
+    means = np.array([part.mean() for part in parts])
+    order = np.argsort(np.concatenate([t, means]), kind="stable")
+    return _Knots(
+        np.concatenate([t, means])[order],
+        np.concatenate([np.array(numbers, dtype=np.int64), np.full(len(means), -1)])[order],
+        np.concatenate([points, place(curve, means, fields) if len(means) else np.zeros((0, 3))])[order],
+    )
+
+
+def _between_knots(loop: _Loop, k: int, knots: _Knots) -> tuple[int, int]:
+    """The knots at which the k-th run of a loop starts and ends; the same twice where nothing of it is left."""
+    run = loop.runs[k]
+    start, end = (knots.at(t, int(c)) for t, c in zip((run.start, run.end), loop.corners[k], strict=True))
+    return (start, end) if (end - start) * run.sign > 0 else (start, start)
+
+
+def _find_edges(
+    curves: Sequence[Curve], knots: Sequence[_Knots], loops: Sequence[_Loop]
+) -> tuple[list[Edge], dict[tuple[int, int], int]]:
+    """What both faces of a curve run along, from knot to knot; and its number by curve and first knot."""
+    had: list[list[set[int]]] = [[set() for _ in own.t] for own in knots]
+    for loop in loops:
+        for k, run in enumerate(loop.runs):
+            start, end = _between_knots(loop, k, knots[run.curve])
+            for knot in range(min(start, end), max(start, end)):
+                had[run.curve][knot].add(loop.face)
+    edges: list[Edge] = []
+    number_of = {}
+    for number, (curve, own) in enumerate(zip(curves, knots, strict=True)):
+        for knot, faces in enumerate(had[number]):
+            if faces == set(curve.pair):
+                number_of[number, knot] = len(edges)
+                inner = between(curve, own.t[knot], own.t[knot + 1])
+                points = np.concatenate([own.points[knot : knot + 1], inner, own.points[knot + 1 : knot + 2]])
+                edges.append(Edge(curve.pair, points, (int(own.corners[knot]), int(own.corners[knot + 1]))))
+    return edges, number_of
+
+
+def _ring(
+    loop: _Loop,
+    curves: Sequence[Curve],
+    knots: Sequence[_Knots],
+    edges: Sequence[Edge],
+    number_of: Mapping[tuple[int, int], int],
+) -> Ring:
+    """The loop put together from edges and from what is open."""
+    if not loop.runs:
+        return Ring(loop.points, np.full(len(loop.points), -1))
+    met = {meeting.run for meeting in loop.meetings}
+    points, numbers = [], []
+    for k, run in enumerate(loop.runs):
+        own = knots[run.curve]
+        start, end = _between_knots(loop, k, own)
+        for knot in range(start, end, run.sign):
+            low, high = sorted((knot, knot + run.sign))
+            edge = number_of.get((run.curve, low), -1)
+            inner = between(curves[run.curve], own.t[low], own.t[high])
+            line = np.concatenate([own.points[low : low + 1], inner, own.points[high : high + 1]])
+            points.append(line[:: run.sign][:-1])
+            numbers += [edge] * (len(line) - 1)
+        if k not in met:
+            following = loop.runs[(k + 1) % len(loop.runs)]
+            way = open_part(loop.points, run.last, following.first)[1:-1]
+            points.append(np.concatenate([own.points[end : end + 1], way]))
+            numbers += [-1] * (len(way) + 1)
+    return Ring(np.concatenate(points).reshape(-1, 3), np.array(numbers))

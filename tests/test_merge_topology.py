@@ -1,0 +1,217 @@
+"""Faces, creases and corners of a merged map are one: creases are shared, corners single, open borders stay open."""
+
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import trimesh
+from face_maps import bowed, boxed, map_of, plate, wall
+from face_scenes import simulated_place
+
+from bsmap_cli.core.bspline import evaluate_surface
+from bsmap_cli.core.uncertainty import sensor_covariance
+from bsmap_cli.export.tessellation import tessellate_map
+from bsmap_cli.fit import fit_surfaces
+from bsmap_cli.merge import merge_surfaces
+from bsmap_cli.merge.extent import extended
+from bsmap_cli.merge.planar import field_of
+from bsmap_cli.model import BSplineSurface, Crease, SurfaceMap, TrimLoop
+from bsmap_cli.params import FitParams, MergeParams
+
+LOW, HIGH = (0.0, 0.0, 0.0), (5.0, 4.0, 2.5)
+
+
+def merged(*maps):
+    return merge_surfaces(maps, MergeParams())
+
+
+def whole_mesh(surface_map, tolerance=0.002):
+    """One mesh of all faces, vertices that are the same to the last bit merged."""
+    meshes = tessellate_map(surface_map, tolerance)
+    offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
+    vertices, number = np.unique(np.concatenate([mesh.vertices for mesh in meshes]), axis=0, return_inverse=True)
+    triangles = np.concatenate([mesh.triangles + o for mesh, o in zip(meshes, offsets, strict=True)])
+    return trimesh.Trimesh(vertices, number[triangles], process=False)
+
+
+def check_creases(surface_map, within=1e-6):
+    """What holds of every map: sides along creases are the creases' points; these lie on both surfaces."""
+    by_name = {surface.name: surface for surface in surface_map.surfaces}
+    for number, crease in enumerate(surface_map.creases):
+        for end, corner in zip((crease.points[0], crease.points[-1]), crease.corners, strict=True):
+            assert corner < 0 or np.array_equal(end, surface_map.corners[corner])
+        for name in crease.surfaces:
+            sides, wanted = sides_along(by_name[name], number), segments(crease.points)
+            assert len(sides) == len(wanted)
+            off = np.abs(np.array(sides)[:, None] - wanted).max(axis=(2, 3))
+            assert off.min(axis=0).max() < within
+            assert off.min(axis=1).max() < within
+
+
+def sides_along(surface, number):
+    """Ends of the sides of a surface's loops along a crease, as of `segments`."""
+    out = []
+    for loop in surface.trims:
+        at = evaluate_surface(surface, *loop.parameters.T)
+        closed = segments(np.concatenate([at, at[:1]]))
+        out += [closed[k] for k in np.flatnonzero(loop.creases == number)]
+    return out
+
+
+def segments(points):
+    """Both ends of each segment of a polyline, the lower one (to a tenth of a millimetre) first."""
+    pairs = pairwise(points)
+    return [(a, b) if tuple(a.round(4) + 0.0) < tuple(b.round(4) + 0.0) else (b, a) for a, b in pairs]
+
+
+def degrees(surface_map):
+    """How many creases end in each corner."""
+    return np.bincount([c for crease in surface_map.creases for c in crease.corners if c >= 0])
+
+
+def test_box_has_six_faces_twelve_creases_eight_corners_and_a_closed_mesh():
+    result = merged(boxed("a", LOW, HIGH))
+    assert (len(result.surfaces), len(result.creases), len(result.corners)) == (6, 12, 8)
+    assert degrees(result).tolist() == [3] * 8
+    check_creases(result)
+    mesh = whole_mesh(result)
+    assert mesh.is_watertight
+    assert len(mesh.vertices) == 8
+    assert len(mesh.faces) == 12
+
+
+def halves(shift=0.0):
+    """A box that two data sets see half each; the second one's pose is off by `shift` metres in height."""
+    west = ["floor", "ceiling", "south", "north", "west"]
+    east = ["floor", "ceiling", "south", "north", "east"]
+    moved = np.array([0.0, 0.0, shift])
+    return boxed("a", LOW, (3.0, 4.0, 2.5), west), boxed("b", np.add((2.0, 0.0, 0.0), moved), np.add(HIGH, moved), east)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.002])
+def test_box_of_two_halves_is_closed_too(shift):
+    result = merged(*halves(shift))
+    assert (len(result.surfaces), len(result.creases), len(result.corners)) == (6, 12, 8)
+    check_creases(result)
+    mesh = whole_mesh(result)
+    assert mesh.is_watertight
+    assert mesh.volume == pytest.approx(50.0, rel=0.002) or mesh.volume == pytest.approx(-50.0, rel=0.002)
+
+
+def test_corners_lie_on_all_faces_that_meet_there():
+    result = merged(*halves(0.002))
+    by_name = {surface.name: field_of(surface) for surface in result.surfaces}
+    for number, corner in enumerate(result.corners):
+        names = {name for crease in result.creases if number in crease.corners for name in crease.surfaces}
+        assert len(names) == 3
+        for name in names:
+            base = by_name[name].base
+            assert abs(base.local(corner[None])[0, 2]) < 2e-3  # the fused plane is hardly tilted
+    check_creases(result)
+
+
+def test_missing_side_leaves_its_four_edges_open():
+    result = merged(boxed("a", LOW, HIGH, ("floor", "south", "north", "west", "east")))
+    assert (len(result.surfaces), len(result.creases), len(result.corners)) == (5, 8, 4)
+    assert sorted(c for crease in result.creases for c in crease.corners if c < 0) == [-1] * 4
+    check_creases(result)
+    mesh = whole_mesh(result)
+    assert not mesh.is_watertight
+    edges, count = np.unique(np.sort(mesh.edges, axis=1), axis=0, return_counts=True)
+    ends = mesh.vertices[edges[count == 1]]
+    assert np.all(ends[..., 2] == pytest.approx(2.5, abs=1e-9))
+
+
+def cut_short(surface, along_u, along_v):
+    """The plate without the triangle at its first corner, with legs of these lengths in metres."""
+    loop, P = surface.trims[0], surface.control_points
+    first = [along_u / np.linalg.norm(P[1, 0] - P[0, 0]), 0.0]
+    last = [0.0, along_v / np.linalg.norm(P[0, 1] - P[0, 0])]
+    parameters = np.concatenate([[first], loop.parameters[1:], [last]])
+    return BSplineSurface(**{**vars(surface), "trims": (TrimLoop(parameters, np.append(loop.creases, -1)),)})
+
+
+def without_corner(lengths, sides=("floor",)):
+    """Box of which some sides lack the corner at the origin."""
+    whole = boxed("a", LOW, HIGH)
+    faces = [cut_short(s, *lengths) if s.name.split("/")[1] in sides else s for s in whole.surfaces]
+    return SurfaceMap(tuple(faces), whole.data_sets, creases=whole.creases)
+
+
+def test_small_open_corner_is_closed():
+    result = merged(without_corner((0.08, 0.05), ("floor", "south", "west")))
+    assert (len(result.creases), len(result.corners)) == (12, 8)
+    check_creases(result)
+    assert whole_mesh(result).is_watertight
+
+
+def test_corner_of_the_floor_is_filled_where_both_walls_reach_it():
+    result = merged(without_corner((0.45, 0.3)))
+    assert (len(result.creases), len(result.corners)) == (12, 8)
+    assert whole_mesh(result).is_watertight
+
+
+def test_larger_open_corner_stays_open():
+    result = merged(without_corner((0.45, 0.3), ("floor", "south", "west")))
+    check_creases(result)
+    assert sum(c < 0 for crease in result.creases for c in crease.corners) == 3
+    assert not whole_mesh(result).is_watertight
+
+
+def test_crease_that_ends_at_a_wall_gives_its_crease_a_corner():
+    """A ramp begins in the middle of a wall: the wall's lower border goes straight on, in two creases."""
+    flat = plate("a/1", (0, 0, 0), (2, 0, 0), (0, 3, 0), (2, 1.5), (0, 1, -1, -1))
+    ramp = plate("a/2", (2, 0, 0), (2, 0, 0.3), (0, 3, 0), (2, 1.5), (2, -1, -1, 1))
+    corners = np.array([[0, 0], [0.5, 0], [1.0, 0.1], [1, 1], [0, 1]])
+    wall = plate("a/3", (0, 0, 0), (4, 0, 0), (0, 0, 3), (2, 1.5))
+    wall = BSplineSurface(**{**vars(wall), "trims": (TrimLoop(corners, np.array([0, 2, -1, -1, -1])),)})
+    creases = [
+        Crease(("a/1", "a/3"), np.array([[0, 0, 0], [2, 0, 0.0]])),
+        Crease(("a/1", "a/2"), np.array([[2, 0, 0], [2, 3, 0.0]])),
+        Crease(("a/2", "a/3"), np.array([[2, 0, 0], [4, 0, 0.3]])),
+    ]
+    result = merged(map_of(flat, ramp, wall, creases=creases))
+    assert (len(result.creases), len(result.corners)) == (3, 1)
+    np.testing.assert_allclose(result.corners, [[2, 0, 0]], atol=1e-6)
+    assert degrees(result).tolist() == [3]
+    check_creases(result)
+
+
+@cache
+def room():
+    place = simulated_place("room")
+    return merged(fit_surfaces(place.cloud, FitParams(method="faces")))
+
+
+def test_creases_of_a_room_are_shared_to_the_last_bit():
+    result = room()
+    check_creases(result, 2e-5)
+    assert len(result.creases) > 25
+    assert np.count_nonzero(degrees(result) >= 3) >= 8
+    meshes = dict(zip([s.name for s in result.surfaces], tessellate_map(result, 0.002), strict=True))
+    for crease in result.creases:
+        for name in crease.surfaces:
+            vertices = {tuple(p) for p in meshes[name].vertices.tolist()}
+            assert {tuple(p) for p in crease.points.tolist()} <= vertices
+
+
+def test_order_of_the_input_does_not_matter():
+    one, other = halves(0.002)
+    first, second = merged(one, other), merged(other, one)
+    assert len(first.corners) == len(second.corners)
+    order = [np.lexsort(m.corners.round(6).T) for m in (first, second)]
+    np.testing.assert_allclose(first.corners[order[0]], second.corners[order[1]], atol=1e-9)
+    pairs = [sorted(tuple(sorted(c.surfaces)) for c in m.creases) for m in (first, second)]
+    assert pairs[0] == pairs[1]
+
+
+def test_extended_surface_is_the_same_where_it_was():
+    surface = bowed(wall("a/1", 0.0, 4.0), 0.1)
+    low, high = np.array([-0.02, 0.0]), np.array([1.03, 1.1])
+    larger = extended(surface, low, high)
+    u, v = np.random.default_rng(0).uniform(size=(2, 50))
+    moved = ((u - low[0]) / (high[0] - low[0]), (v - low[1]) / (high[1] - low[1]))
+    np.testing.assert_allclose(evaluate_surface(larger, *moved), evaluate_surface(surface, u, v), atol=1e-12)
+    np.testing.assert_allclose(sensor_covariance(larger, *moved), sensor_covariance(surface, u, v), atol=1e-15)
+    np.testing.assert_allclose(evaluate_surface(larger, [1.0], [0.0])[0, 0], 4.0 * high[0])

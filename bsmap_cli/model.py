@@ -257,6 +257,11 @@ class PosePart:
         if self.modes is not None:
             _check(self, modes=(3, None))
 
+    @property
+    def own(self) -> Array:
+        """(3, 3) covariance of what this data set has in common with no other."""
+        return self.covariance if self.modes is None else self.covariance - self.modes @ self.modes.T
+
 
 @dataclass(frozen=True)
 class SurfaceCovariance:

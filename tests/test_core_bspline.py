@@ -1,5 +1,7 @@
 """B-spline basis, evaluation, refinement and covariance against slow twins and exact identities."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from reference import naive_basis, naive_surface
@@ -17,7 +19,13 @@ from bsmap_cli.core.bspline import (
     restrict,
 )
 from bsmap_cli.core.gaussian import pack, unpack
-from bsmap_cli.core.uncertainty import control_point_covariances, sensor_covariance, surface_covariance
+from bsmap_cli.core.uncertainty import (
+    control_point_covariances,
+    pose_covariance,
+    pose_difference,
+    sensor_covariance,
+    surface_covariance,
+)
 from bsmap_cli.model import BSplineSurface, PosePart, Residuals, SurfaceCovariance
 
 DEGREES = range(1, 6)
@@ -220,6 +228,35 @@ def test_sensor_covariance_equals_dense_product():
     weights = np.einsum("ni,nj->nij", design_matrix(surface.knots_u, 3, u), design_matrix(surface.knots_v, 2, v))
     wanted = np.einsum("nij,ijaklc,nkl->nac", weights, C, weights)
     np.testing.assert_allclose(sensor_covariance(surface, u, v), wanted, atol=1e-12)
+
+
+def test_pose_errors_of_one_trajectory_are_not_independent():
+    """Against the joint covariance of all poses, written out."""
+    rng = np.random.default_rng(8)
+    modes, own = rng.normal(size=(4, 3, 2)) * 0.01, rng.normal(size=(4, 3, 3)) * 0.01
+    trajectories, weights = ("t", "t", "u", "t"), (0.2, 0.3, 0.4, 0.1)
+    parts, joint = [], np.zeros((12, 12))
+    for a in range(4):
+        for b in range(4):
+            if trajectories[a] == trajectories[b]:
+                joint[3 * a : 3 * a + 3, 3 * b : 3 * b + 3] = modes[a] @ modes[b].T + (a == b) * own[a] @ own[a].T
+        covariance = joint[3 * a : 3 * a + 3, 3 * a : 3 * a + 3]
+        parts.append(PosePart(f"d{a}", rng.normal(size=2), covariance, weights[a], modes[a], trajectories[a]))
+
+    def rigid(point, some):
+        blocks = [
+            p.weight * np.array([[1, 0, p.centre[1] - point[1]], [0, 1, point[0] - p.centre[0]], [0, 0, 0]])
+            for p in some
+        ]
+        return np.concatenate(blocks, axis=1)
+
+    points = rng.normal(size=(5, 3)) * 3
+    for found, point in zip(pose_covariance(parts, points), points, strict=True):
+        np.testing.assert_allclose(found, rigid(point, parts) @ joint @ rigid(point, parts).T, atol=1e-15)
+    difference = pose_difference(parts[:3], parts[1:])
+    wanted = [replace(part, weight=w) for part, w in zip(parts, (0.2, 0.0, 0.0, -0.1), strict=True)]
+    for found, point in zip(pose_covariance(difference, points), points, strict=True):
+        np.testing.assert_allclose(found, rigid(point, wanted) @ joint @ rigid(point, wanted).T, atol=1e-15)
 
 
 def test_pose_parts_move_points_as_a_rigid_body():

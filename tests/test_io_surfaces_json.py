@@ -40,7 +40,7 @@ def surface(name: str = "translation-0", nu: int = 7, nv: int = 5) -> BSplineSur
     half = rng.normal(size=(nu, nv, 3, 3)) * 1e-3
     C = half @ half.swapaxes(-1, -2)
     pose = rng.normal(size=(3, 3)) * 1e-2
-    part = PosePart(name, rng.normal(size=2), pose @ pose.T, 0.625)
+    part = PosePart(name, rng.normal(size=2), pose @ pose.T, 0.625, pose[:, :2], "1a2b")
     knots = [np.r_[[0.0] * 4, np.sort(rng.uniform(size=n - 4)), [1.0] * 4] for n in (nu, nv)]
     blocks = C[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     return BSplineSurface(
@@ -83,6 +83,8 @@ def test_surfaces_come_back_to_what_the_numbers_are_worth(tmp_path: Path, name: 
         assert (part.data_set, part.weight) == (wanted.data_set, wanted.weight)
         np.testing.assert_allclose(part.covariance, wanted.covariance, rtol=0.51e-3)
         np.testing.assert_allclose(part.centre, wanted.centre, atol=0.51e-6)
+        np.testing.assert_allclose(part.modes, wanted.modes, rtol=0.51e-3)
+        assert part.trajectory == wanted.trajectory
         assert one.residuals.points == other.residuals.points
         assert one.residuals.mean == pytest.approx(other.residuals.mean, rel=1e-5)
     assert read_provenance(path) == MADE
@@ -139,7 +141,7 @@ S = "surfaces", 0
 WHERE = r"a\.json: surfaces\[0\] \(translation-0\): "
 WRONG = [
     (change("format", to="other"), r"is JSON, but not surfaces of bsmap"),
-    (change("version", to=4), r"is of version 4, this bsmap reads 3"),
+    (change("version", to=9), r"is of version 9, this bsmap reads 4"),
     (change("surfaces", to=None), r"file: surfaces is missing"),
     (change("notes", to=[]), r"file: notes is \[\], wanted an object"),
     (change(*S, to="x"), r"surfaces\[0\]: is 'x', wanted an object"),
@@ -164,11 +166,10 @@ WRONG = [
     ),
     (change(*S, "covariance", "correlation_u", 0, to=2.0), r"correlation_u has a diagonal that is not 1"),
     (change(*S, "covariance", "correlation_v", 3, to=None), r"covariance: correlation_v is 14, wanted 15"),
-    (
-        change(*S, "covariance", "pose", 0, "covariance", 0, to=-1),
-        r"pose\[0\]: covariance is not positive semidefinite",
-    ),
+    (change("poses", 0, "covariance", 0, to=-1), r"poses\[0\]: covariance is not positive semidefinite"),
     (change(*S, "covariance", "pose", 0, "weight", to="1"), r"pose\[0\]: weight is '1', wanted numbers"),
+    (change(*S, "covariance", "pose", 0, "data_set", to="x"), r"pose\[0\]: there is no pose of a data set 'x'"),
+    (change("poses", 1, "modes", to=[[0.0, 0.0, 0.0]]), r"poses\[1\]: has 1 modes, others of its trajectory 2"),
     (change(*S, "covariance", to=None), WHERE + "covariance is missing"),
     (change(*S, "residuals", "rms", to=math.inf), WHERE + "residuals: rms is inf, wanted a finite number"),
     (change(*S, "residuals", "points", to=-1), WHERE + "residuals: points is -1, wanted 0 or more"),

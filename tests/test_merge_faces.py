@@ -1,5 +1,6 @@
 """Faces of several data sets joined to one map: what is one becomes one, what is two stays two."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -113,6 +114,34 @@ def test_pose_error_of_one_data_set_does_not_double_the_walls():
     assert len(result.surfaces) == 2
     levels = sorted(np.mean(s.control_points[..., 1]) for s in result.surfaces)
     np.testing.assert_allclose(levels, [0.01, 3.01], atol=1e-3)
+
+
+def in_common(surface, modes):
+    """The wall with an error of pose that its trajectory has in common, and 1 mm and 0.1 mrad of its own."""
+    (part,) = surface.covariance.pose
+    covariance = modes @ modes.T + np.diag([1e-6, 1e-6, 1e-8])
+    part = replace(part, covariance=covariance, modes=modes, trajectory="t")
+    return replace(surface, covariance=replace(surface.covariance, pose=(part,)))
+
+
+def test_what_poses_have_in_common_is_neither_corrected_nor_averaged_away():
+    """Two walls 2 mm apart, whose poses err by 5 cm together."""
+    modes = np.array([[0.05, 0.0], [0.0, 0.05], [0.0, 0.0]])
+    parts = [in_common(wall(f"{n}/1", 0.0, 4.0, offset=o), modes) for n, o in (("a", 0.0), ("b", 0.002))]
+    result = merged(*parts)
+    (one,) = result.surfaces
+    assert result.notes["largest_correction"] < 0.0015
+    covariance = surface_covariance(one, np.array([0.5]), np.array([0.5]))[0]
+    assert covariance[1, 1] == pytest.approx(0.05**2, rel=0.01)
+
+
+def test_walls_apart_are_not_joined_for_an_error_that_both_have_in_common():
+    """With independent errors of 5 cm the gate would let the same pair pass."""
+    modes = np.array([[0.05, 0.0], [0.0, 0.05], [0.0, 0.0]])
+    pose = np.diag([0.05**2, 0.05**2, 1e-8])
+    offsets = (("a", 0.0), ("b", 0.025))
+    assert len(merged(*[in_common(wall(f"{n}/1", 0.0, 4.0, offset=o), modes) for n, o in offsets]).surfaces) == 2
+    assert len(merged(*[wall(f"{n}/1", 0.0, 4.0, offset=o, pose=pose) for n, o in offsets]).surfaces) == 1
 
 
 def test_window_that_nobody_saw_stays_open_and_half_seen_ones_are_closed():

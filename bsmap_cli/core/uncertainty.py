@@ -1,6 +1,7 @@
 """Covariance of a B-spline surface from that of its control points, Eq. (33) and (37)."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,17 +16,32 @@ CHUNK = 2048
 def pose_covariance(pose: Sequence[PosePart], points: Array) -> Array:
     """Covariance (..., 3, 3) in map that points (..., 3) have from the pose parts of their surface.
 
-    sum w^2 J C J' with J = [[1, 0, -(y - c_y)], [0, 1, x - c_x], [0, 0, 0]]: the shares of the data sets are
-    weighted means, their pose errors independent (an approximation: sets one after another share some drift).
+    sum w^2 J C J' with J = [[1, 0, -(y - c_y)], [0, 1, x - c_x], [0, 0, 0]], for the shares of the data sets are
+    weighted means, and of what the data sets of a trajectory have in common (sum w J M) (sum w J M)'.
     """
     total = np.zeros((*points.shape, 3))
+    common: dict[str, Array] = {}
     for part in pose:
         J = np.zeros((*points.shape, 3))
-        J[..., 0, 0] = J[..., 1, 1] = 1.0
-        J[..., 0, 2] = part.centre[1] - points[..., 1]
-        J[..., 1, 2] = points[..., 0] - part.centre[0]
-        total += part.weight**2 * (J @ part.covariance @ np.swapaxes(J, -1, -2))
+        J[..., 0, 0] = J[..., 1, 1] = part.weight
+        J[..., 0, 2] = part.weight * (part.centre[1] - points[..., 1])
+        J[..., 1, 2] = part.weight * (points[..., 0] - part.centre[0])
+        total += J @ part.own @ np.swapaxes(J, -1, -2)
+        if part.modes is not None:
+            moved = J @ part.modes
+            common[part.trajectory] = common[part.trajectory] + moved if part.trajectory in common else moved
+    for moved in common.values():
+        total += moved @ np.swapaxes(moved, -1, -2)
     return total
+
+
+def pose_difference(first: Sequence[PosePart], second: Sequence[PosePart]) -> tuple[PosePart, ...]:
+    """Pose parts of the difference of two surfaces' points: what both have of a data set is taken off each other."""
+    parts = {part.data_set: part for part in first}
+    for part in second:
+        before = parts[part.data_set].weight if part.data_set in parts else 0.0
+        parts[part.data_set] = replace(part, weight=before - part.weight)
+    return tuple(parts.values())
 
 
 def sensor_covariance(surface: BSplineSurface, u: ArrayLike, v: ArrayLike) -> Array:

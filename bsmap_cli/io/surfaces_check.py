@@ -1,6 +1,7 @@
 """Checked way from the JSON of surfaces_json.py to the model: what is wrong is told by surface, field and value."""
 
 from collections import Counter
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -34,9 +35,10 @@ class MalformedError(ValueError):
 def parse_map(plain: dict[str, Any]) -> SurfaceMap:
     """Surfaces of a file's JSON object; MalformedError where it does not make sense."""
     corners = _points(plain, "corners", "file")
+    poses = _poses(_get(plain, "poses", list, "file"))
     creases = tuple(_crease(c, corners, f"creases[{i}]") for i, c in enumerate(_get(plain, "creases", list, "file")))
     surfaces = tuple(
-        _surface(s, f"surfaces[{i}]", len(creases)) for i, s in enumerate(_get(plain, "surfaces", list, "file"))
+        _surface(s, f"surfaces[{i}]", len(creases), poses) for i, s in enumerate(_get(plain, "surfaces", list, "file"))
     )
     counts = Counter(surface.name for surface in surfaces)
     if twice := sorted(name for name, count in counts.items() if count > 1):
@@ -71,7 +73,7 @@ def _points(plain: Any, key: str, where: str) -> Array:
     return np.zeros((0, 3)) if _get(plain, key, list, where) == [] else _array(plain, key, (None, 3), where)
 
 
-def _surface(plain: Any, where: str, creases: int) -> BSplineSurface:
+def _surface(plain: Any, where: str, creases: int, poses: dict[str, PosePart]) -> BSplineSurface:
     name = _get(plain, "name", str, where)
     where = f"{where} ({name})"
     p, q = (_degree(plain, key, where) for key in ("degree_u", "degree_v"))
@@ -85,7 +87,7 @@ def _surface(plain: Any, where: str, creases: int) -> BSplineSurface:
         knots_u=knots_u,
         knots_v=knots_v,
         control_points=_array(plain, "control_points", (nu, nv, 3), where),
-        covariance=_covariance(_get(plain, "covariance", dict, where), nu, nv, f"{where}: covariance"),
+        covariance=_covariance(_get(plain, "covariance", dict, where), nu, nv, poses, f"{where}: covariance"),
         residuals=_residuals(_get(plain, "residuals", dict, where), f"{where}: residuals"),
         trims=tuple(
             _loop(loop, creases, f"{where}: trims[{i}]") for i, loop in enumerate(_get(plain, "trims", list, where))
@@ -139,21 +141,22 @@ def _knots(plain: dict[str, Any], key: str, degree: int, where: str) -> Array:
     return knots
 
 
-def _covariance(plain: dict[str, Any], nu: int, nv: int, where: str) -> SurfaceCovariance | HeightCovariance:
+def _covariance(
+    plain: dict[str, Any], nu: int, nv: int, poses: dict[str, PosePart], where: str
+) -> SurfaceCovariance | HeightCovariance:
     if "directions" in plain:
-        return _heights(plain, nu, nv, where)
+        return _heights(plain, nu, nv, poses, where)
     blocks = _array(plain, "blocks", (nu, nv, 6), where)
     _check_blocks(blocks, where)
-    parts = _get(plain, "pose", list, where)
     return SurfaceCovariance(
         blocks=blocks,
         correlation_u=_correlation(plain, "correlation_u", nu, where),
         correlation_v=_correlation(plain, "correlation_v", nv, where),
-        pose=tuple(_pose_part(part, f"{where}: pose[{i}]") for i, part in enumerate(parts)),
+        pose=_pose(plain, poses, where),
     )
 
 
-def _heights(plain: dict[str, Any], nu: int, nv: int, where: str) -> HeightCovariance:
+def _heights(plain: dict[str, Any], nu: int, nv: int, poses: dict[str, PosePart], where: str) -> HeightCovariance:
     directions = _array(plain, "directions", (None, None, 3), where)
     if directions.shape[0] not in (1, nu) or directions.shape[1] not in (1, nv):
         got = " x ".join(map(str, directions.shape))
@@ -165,9 +168,29 @@ def _heights(plain: dict[str, Any], nu: int, nv: int, where: str) -> HeightCovar
     eigenvalues = np.linalg.eigvalsh(matrix)
     if eigenvalues[0] < -HEIGHT_TOLERANCE * abs(eigenvalues[-1]):
         raise MalformedError(f"{where}: matrix is not positive semidefinite (eigenvalue {eigenvalues[0]:.3g})")
-    parts = _get(plain, "pose", list, where)
-    pose = tuple(_pose_part(part, f"{where}: pose[{i}]") for i, part in enumerate(parts))
-    return HeightCovariance(directions, matrix, pose)
+    return HeightCovariance(directions, matrix, _pose(plain, poses, where))
+
+
+def _pose(plain: dict[str, Any], poses: dict[str, PosePart], where: str) -> tuple[PosePart, ...]:
+    """Pose parts of a surface, by the data sets that it names."""
+    parts = []
+    for i, one in enumerate(_get(plain, "pose", list, where)):
+        here = f"{where}: pose[{i}]"
+        name, weight = _get(one, "data_set", str, here), _number(one, "weight", here)
+        if name not in poses:
+            raise MalformedError(f"{here}: there is no pose of a data set {name!r}")
+        parts.append(replace(poses[name], weight=weight))
+    return tuple(parts)
+
+
+def _poses(plain: list[Any]) -> dict[str, PosePart]:
+    parts = [_pose_part(part, f"poses[{i}]") for i, part in enumerate(plain)]
+    counts = dict[str, int]()
+    for i, part in enumerate(parts):
+        modes = part.modes.shape[1] if part.modes is not None else counts.get(part.trajectory, 0)
+        if counts.setdefault(part.trajectory, modes) != modes:
+            raise MalformedError(f"poses[{i}]: has {modes} modes, others of its trajectory {counts[part.trajectory]}")
+    return {part.data_set: part for part in parts}
 
 
 def _check_blocks(blocks: Array, where: str) -> None:
@@ -205,8 +228,15 @@ def _pose_part(plain: Any, where: str) -> PosePart:
         data_set=_get(plain, "data_set", str, where),
         centre=_array(plain, "centre", (2,), where),
         covariance=covariance,
-        weight=_number(plain, "weight", where),
+        modes=_modes(plain, where),
+        trajectory=_get(plain, "trajectory", str, where),
     )
+
+
+def _modes(plain: dict[str, Any], where: str) -> Array | None:
+    if plain.get("modes") is None:
+        return None
+    return np.zeros((3, 0)) if plain["modes"] == [] else _array(plain, "modes", (None, 3), where).T
 
 
 def _residuals(plain: dict[str, Any], where: str) -> Residuals:

@@ -1,8 +1,10 @@
 """The artifact of `fit` and `merge`: B-spline surfaces as JSON (.surfaces.json, .map.json; .gz by name).
 
-    {"format": "bsmap-surfaces", "version": 3, "units": "metres, radians, frame map",
+    {"format": "bsmap-surfaces", "version": 4, "units": "metres, radians, frame map",
      "bsmap-provenance": {...},
      "data_sets": [{"name", "movement": "translation" | "rotation", "first_scan", "last_scan", "points"}, ...],
+     "poses": [{"data_set", "centre": [x, y], "covariance": [xx, xy, xt, yy, yt, tt],
+                "trajectory": name, "modes": k x 3, or null where it is not known what poses have in common}, ...],
      "surfaces": [surface, ...],
      "decisions": [{"first", "second", "outcome": "merged" | "refused", "reason", "figures": {...}}, ...],
      "corners": k x 3 points in which creases end together,
@@ -20,7 +22,7 @@
         or, of control points that move along given directions only,
         "directions":          nu or 1 x nv or 1 x 3 unit vectors
         "matrix":              upper triangle row by row of the heights' covariance, n (n + 1) / 2 numbers, n = nu nv
-        and "pose": [{"data_set", "centre": [x, y], "covariance": [xx, xy, xt, yy, yt, tt], "weight"}, ...]},
+        and "pose": [{"data_set", "weight"}, ...]},
      "trims": [{"parameters": k x 2, u and v of a closed polygon,
                 "creases": k numbers of the creases along the sides from each vertex to the next, -1 for none}, ...]
                              no trims: the whole surface; else what the loops together wind around counter-clockwise
@@ -56,7 +58,7 @@ from bsmap_cli.model import (
 )
 
 FORMAT = "bsmap-surfaces"
-VERSION = 3
+VERSION = 4
 
 
 def write_surfaces(path: Path | str, surfaces: SurfaceMap, provenance: Provenance | None = None) -> None:
@@ -75,6 +77,7 @@ def write_surfaces(path: Path | str, surfaces: SurfaceMap, provenance: Provenanc
     parts = [
         _dumps(head)[1:-1],
         _list("data_sets", [plain_json(asdict(data_set)) for data_set in surfaces.data_sets]),
+        _list("poses", [_pose_part(part) for part in _poses(surfaces)]),
         _list("surfaces", [_surface(surface) for surface in surfaces.surfaces]),
         _list("decisions", [plain_json(asdict(decision)) for decision in surfaces.decisions]),
         _list("corners", _rounded(surfaces.corners, 5)),
@@ -131,14 +134,25 @@ def _covariance(covariance: SurfaceCovariance | HeightCovariance) -> dict[str, A
         return {
             "directions": _rounded(covariance.directions, 9),
             "matrix": _significant(_upper(covariance.matrix), 7),
-            "pose": [_pose_part(part) for part in covariance.pose],
+            "pose": [{"data_set": part.data_set, "weight": float(part.weight)} for part in covariance.pose],
         }
     return {
         "blocks": _significant(covariance.blocks, 4),
         "correlation_u": _rounded(_upper(covariance.correlation_u), 6),
         "correlation_v": _rounded(_upper(covariance.correlation_v), 6),
-        "pose": [_pose_part(part) for part in covariance.pose],
+        "pose": [{"data_set": part.data_set, "weight": float(part.weight)} for part in covariance.pose],
     }
+
+
+def _poses(surfaces: SurfaceMap) -> list[PosePart]:
+    """Errors of pose of all data sets that surfaces refer to, each once; ValueError where surfaces tell two of one."""
+    found: dict[str, PosePart] = {}
+    for surface in surfaces.surfaces:
+        for part in surface.covariance.pose:
+            before = found.setdefault(part.data_set, part)
+            if not np.array_equal(before.covariance, part.covariance) or not np.array_equal(before.centre, part.centre):
+                raise ValueError(f"surface {surface.name}: another error of pose of data set {part.data_set}")
+    return [found[name] for name in sorted(found)]
 
 
 def _pose_part(part: PosePart) -> dict[str, Any]:
@@ -146,7 +160,8 @@ def _pose_part(part: PosePart) -> dict[str, Any]:
         "data_set": part.data_set,
         "centre": _rounded(part.centre, 6),
         "covariance": _significant(_upper(part.covariance), 4),
-        "weight": float(part.weight),
+        "trajectory": part.trajectory,
+        "modes": None if part.modes is None else _significant(part.modes.T, 4),
     }
 
 

@@ -1,7 +1,8 @@
 """Small corrections of the data sets' poses, from the faces that several of them share.
 
-Each data set gets an error of pose with the covariance of its PosePart as prior. The heights of the joined faces are
-eliminated one face at a time (Schur complement); what is left is a system of three unknowns a data set.
+Each data set gets an error of pose with the covariance of its PosePart as prior: one of its own, and a share in the
+modes that all data sets of its trajectory have in common. The heights of the joined faces are eliminated one face at a
+time (Schur complement); what is left is a system of three unknowns a data set and those of the modes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,10 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from bsmap_cli.core.gaussian import symmetric_sqrt
 from bsmap_cli.fit.heights import basis_matrix
 from bsmap_cli.fit.selection import smoothness
-from bsmap_cli.merge.information import ROBUST, Joined, Told
+from bsmap_cli.merge.information import ROBUST, Joined, Told, unit_errors
 from bsmap_cli.model import Array, BSplineSurface, Crease, HeightCovariance, PosePart
 
 ROUNDS = 3
@@ -34,32 +34,46 @@ class Correction(NamedTuple):
 def adjust(groups: Sequence[tuple[Sequence[Told], Joined]]) -> dict[str, Correction]:
     """Corrections of all data sets that take part in a group of several faces."""
     parts = {part.data_set: part for told, _ in groups for one in told for part in one.pose}
-    names = sorted(name for name, part in parts.items() if np.any(part.covariance))
-    place = {name: 3 * number for number, name in enumerate(names)}
-    e = np.zeros(3 * len(names))
-    if not len(e):
+    parts = {name: parts[name] for name in sorted(parts) if np.any(parts[name].covariance)}
+    if not parts:
         return {}
+    columns = _columns(parts)
+    e = np.zeros(1 + max(max(some) for some in columns.values()))
     shares = [np.ones(len(told)) for told, _ in groups]
     for _ in range(ROUNDS):
         S, g = np.eye(len(e)), np.zeros(len(e))
         for (told, joined), share in zip(groups, shares, strict=True):
-            used, reduced, right, residuals = _reduced(told, joined, share, place)
+            used, reduced, right, _ = _reduced(told, joined, share, columns)
             S[np.ix_(used, used)] += reduced
             g[used] += right
-            del residuals
         factor = cho_factor(S)
         e = cho_solve(factor, g)
-        shares = [_shares(told, joined, share, place, e) for (told, joined), share in zip(groups, shares, strict=True)]
+        shares = [
+            _shares(told, joined, share, columns, e) for (told, joined), share in zip(groups, shares, strict=True)
+        ]
     left = cho_solve(factor, np.eye(len(e)))
     out = {}
-    for name in names:
-        root, own = symmetric_sqrt(parts[name].covariance), slice(place[name], place[name] + 3)
-        out[name] = Correction(parts[name], root @ e[own], root @ left[own, own] @ root)
+    for name, part in parts.items():
+        root, own = unit_errors(part), columns[name]
+        out[name] = Correction(part, root @ e[own], root @ left[np.ix_(own, own)] @ root.T)
+    return out
+
+
+def _columns(parts: Mapping[str, PosePart]) -> dict[str, list[int]]:
+    """Numbers of each data set's unknowns, in the order of `unit_errors`; a trajectory's modes are there once."""
+    out, modes, size = {}, dict[str, list[int]](), 0
+    for name, part in parts.items():
+        out[name], size = list(range(size, size + 3)), size + 3
+        if part.modes is not None:
+            if part.trajectory not in modes:
+                count = part.modes.shape[1]
+                modes[part.trajectory], size = list(range(size, size + count)), size + count
+            out[name] += modes[part.trajectory]
     return out
 
 
 class _Rows(NamedTuple):
-    """Whitened equations of one face told: N (k, n) by heights, G (k, 3 p) by pose, y (k,) wanted; columns of G."""
+    """Whitened equations of one face told: N (k, n) by heights, G (k, p) by pose, y (k,) wanted; columns of G."""
 
     N: Array
     G: Array
@@ -67,16 +81,22 @@ class _Rows(NamedTuple):
     columns: list[int]
 
 
-def _rows(one: Told, joined: Joined, place: Mapping[str, int]) -> _Rows:
+def _rows(one: Told, joined: Joined, place: Mapping[str, list[int]]) -> _Rows:
     N = one.root @ (one.carry @ basis_matrix(joined.field.knots, one.uv))
-    G = one.root @ one.by_pose
-    kept = [k for k, part in enumerate(one.pose) if part.data_set in place]
-    columns = [place[one.pose[k].data_set] + axis for k in kept for axis in range(3)]
-    return _Rows(N, G[:, [3 * k + axis for k in kept for axis in range(3)]], one.root @ one.heights, columns)
+    G = np.zeros((len(N), 1 + max(max(some) for some in place.values())))
+    first = 0
+    for part in one.pose:
+        width = unit_errors(part).shape[1]
+        if part.data_set in place:
+            # A mode has an effect by way of each data set of its trajectory.
+            G[:, place[part.data_set]] += one.by_pose[:, first : first + width]
+        first += width
+    used = sorted({column for part in one.pose for column in place.get(part.data_set, ())})
+    return _Rows(N, one.root @ G[:, used], one.root @ one.heights, used)
 
 
 def _reduced(
-    told: Sequence[Told], joined: Joined, share: Array, place: Mapping[str, int]
+    told: Sequence[Told], joined: Joined, share: Array, place: Mapping[str, list[int]]
 ) -> tuple[list[int], Array, Array, Array]:
     """Columns used, Schur complement and right side after the heights are eliminated, heights without errors."""
     rows = [_rows(one, joined, place) for one in told]
@@ -98,7 +118,7 @@ def _reduced(
     return used, (reduced + reduced.T) / 2.0, by_pose - B.T @ heights, heights
 
 
-def _shares(told: Sequence[Told], joined: Joined, share: Array, place: Mapping[str, int], e: Array) -> Array:
+def _shares(told: Sequence[Told], joined: Joined, share: Array, place: Mapping[str, list[int]], e: Array) -> Array:
     """Weights of the faces told by how far they are off at errors e (Huber)."""
     rows = [_rows(one, joined, place) for one in told]
     H = smoothness(joined.field.knots) + sum(w * r.N.T @ r.N for w, r in zip(share, rows, strict=True))
@@ -134,7 +154,9 @@ def moved(surface: BSplineSurface, corrections: Mapping[str, Correction]) -> BSp
 def with_left_over(surface: BSplineSurface, corrections: Mapping[str, Correction]) -> BSplineSurface:
     """The surface with the pose covariance that is left after the adjustment, for the gates of the second round."""
     pose = tuple(
-        replace(part, covariance=corrections[part.data_set].covariance) if part.data_set in corrections else part
+        replace(part, covariance=corrections[part.data_set].covariance, modes=None)
+        if part.data_set in corrections
+        else part
         for part in surface.covariance.pose
     )
     return replace(surface, covariance=replace(surface.covariance, pose=pose))

@@ -139,6 +139,6 @@ def _offsets(face: PlanarFace, on: PlanarFace, params: MergeParams) -> _Offsets:
     uv = on.field.parameters(local)
     h = local[:, 2] - evaluate(on.field, uv)[0]
     variance = face.variances[near] + height_variances(on.surface, on.field, uv) + 2.0 * params.flatness**2
-    variance += pose_variances(face, on, points) + pose_variances(on, face, points)
+    variance += pose_variances(on, face, points)
     inside = shapely.contains_xy(on.region, local[:, :2]).astype(float)
     return _Offsets(h, variance, face.areas[near], inside)

@@ -1,6 +1,7 @@
 """How the covariance of a surface's control points follows when the surface is cut, sampled, fused and fitted again."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -75,5 +76,5 @@ def share_pose(first: Sequence[PosePart], second: Sequence[PosePart], gain: floa
         for part in parts:
             known = shares.get(part.data_set)
             weight = factor * part.weight + (known.weight if known else 0.0)
-            shares[part.data_set] = PosePart(part.data_set, part.centre, part.covariance, weight)
+            shares[part.data_set] = replace(part, weight=weight)
     return tuple(shares.values())

@@ -8,7 +8,8 @@ the joined face to those of A the sum of
 is least. It is a sum over data sets, so that neither their order matters nor how many surveys a face was joined from.
 Walls are not perfect, and faces not quite what they are fitted to: whether data sets agree, and whether their
 differences pay for a knot, is told by Lambda_A, the inverse of C_A and the covariance of what walls leave their spline
-by. G_A leads from the errors of pose e (unit variance each) to c_A.
+by. G_A leads from the errors of pose e (unit variance each: three of the data set's own, and those of the modes that
+its trajectory has) to c_A.
 """
 
 from collections.abc import Sequence
@@ -70,7 +71,7 @@ class Told(NamedTuple):
     uv : (m, 2) parameters in the frame of samples of its rectangle.  carry : (k, m) from heights there to its own.
     heights : (k,) its own, above the frame's plane.  root : (k, k) lower triangular, root' root = Lambda.
     sensor_root : (k, k) likewise of the inverse of the sensor part.
-    covariance : (k, k) of the heights, sensor part.  by_pose : (k, 3 p), of each of its pose parts in turn.
+    covariance : (k, k) of the heights, sensor part.  by_pose : (k, p), of each of its pose parts in turn.
     basis : (m, k) back from its heights to the samples.  stiffness : 1 / metres, weight of what it cannot follow there.
     degrees, inner : along s and t of the frame, of its own spline: degrees, and knots in the frame's parameters, those
     at its ends too where it is more than bilinear.
@@ -167,11 +168,17 @@ def _knots_in(field: HeightField, frame: Frame) -> tuple[tuple[int, int], tuple[
 
 
 def _lifted(part: PosePart, points: Array, normal: Array) -> Array:
-    """(m, 3) change of the heights of points (m, 3) by unit errors of a pose part, by its share."""
+    """(m, 3 + modes) change of the heights of points (m, 3) by unit errors of a pose part, by its share."""
     J = np.zeros((len(points), 3))
     J[:, :2] = normal[:2]
     J[:, 2] = normal[1] * (points[:, 0] - part.centre[0]) - normal[0] * (points[:, 1] - part.centre[1])
-    return np.asarray(part.weight * J @ symmetric_sqrt(part.covariance))
+    return np.asarray(part.weight * J @ unit_errors(part))
+
+
+def unit_errors(part: PosePart) -> Array:
+    """(3, 3 + modes) error of pose by errors of unit variance: three of the data set's own, then the modes'."""
+    own = symmetric_sqrt(part.own)
+    return own if part.modes is None else np.concatenate([own, part.modes], axis=1)
 
 
 def join(told: Sequence[Told], frame: Frame) -> Joined:

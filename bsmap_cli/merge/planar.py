@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
-from bsmap_cli.core.uncertainty import pose_covariance
+from bsmap_cli.core.uncertainty import pose_covariance, pose_difference
 from bsmap_cli.fit.heights import HeightField, Knots, PlaneBase, basis_matrix, evaluate
 from bsmap_cli.merge.facing import sensor_position
 from bsmap_cli.merge.regions import Region, region_of
@@ -96,11 +96,10 @@ def height_variances(surface: BSplineSurface, field: HeightField, uv: Array) -> 
 
 
 def pose_variances(face: PlanarFace, other: PlanarFace, points: Array) -> Array:
-    """(n,) variance across the plane of `face` that the poses of data sets which `other` has not give its points."""
-    shared = {part.data_set for part in other.surface.covariance.pose}
-    own = [part for part in face.surface.covariance.pose if part.data_set not in shared]
+    """(n,) variance across the plane of `face` that the poses of both give the difference of their points there."""
+    both = pose_difference(face.surface.covariance.pose, other.surface.covariance.pose)
     n = face.normal
-    return np.asarray(np.einsum("i,nij,j->n", n, pose_covariance(own, points), n))
+    return np.asarray(np.einsum("i,nij,j->n", n, pose_covariance(both, points), n))
 
 
 def _across(vector: Array, normal: Array) -> Array:

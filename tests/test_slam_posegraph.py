@@ -7,8 +7,9 @@ from scipy import sparse
 from scipy.stats import chi2
 
 from bsmap_cli.core import se2
+from bsmap_cli.core.table import joined
 from bsmap_cli.errors import BsmapError
-from bsmap_cli.slam.posegraph import Edges, concatenate, factorise, optimise, residuals, weighted
+from bsmap_cli.slam.posegraph import Edges, factorise, optimise, residuals, weighted
 
 SPREAD = np.array([0.02, 0.02, 0.01])
 
@@ -40,7 +41,7 @@ def noisy_square(seed: int) -> tuple[np.ndarray, np.ndarray, Edges]:
     later = np.arange(n // 2, n, 5)
     again = se2.between(truth[later - n // 2], truth[later]) + SPREAD * rng.normal(size=(len(later), 3))
     chain, loops = edges_between(first, second, steps), edges_between(later - n // 2, later, again)
-    return truth, np.array(start), concatenate([chain, loops])
+    return truth, np.array(start), joined([chain, loops])
 
 
 def place_error(poses, truth):
@@ -103,7 +104,7 @@ def test_gross_false_closure_loses_its_weight():
     _, start, edges = noisy_square(3)
     without = optimise(start, edges).poses
     false = edges_between([5], [25], np.zeros((1, 3)), robust=True)
-    found = optimise(start, concatenate([edges, false])).poses
+    found = optimise(start, joined([edges, false])).poses
     distance, information = weighted(false, residuals(found, false)[0])
     assert information[0, 0, 0] / false.information[0, 0, 0] < 1e-3
     assert distance[0] > 1e4

@@ -3,15 +3,15 @@
 import numpy as np
 
 from bsmap_cli.core import se2
-from bsmap_cli.core.table import take
+from bsmap_cli.core.table import joined, take
 from bsmap_cli.model import Array, IntArray, LineMap, LoopClosures, ScanLog, SlamMap, StepStatistics, Trajectory
 from bsmap_cli.params import SlamParams
 from bsmap_cli.slam.lines import MappedLines, map_lines
 from bsmap_cli.slam.loops import Closures, close_loops, is_loop
 from bsmap_cli.slam.marginals import Marginals, marginals
 from bsmap_cli.slam.motion import beam_motion, odometry_motion
-from bsmap_cli.slam.posegraph import Edges, concatenate
-from bsmap_cli.slam.segments import Segments, extract_segments, scan_points
+from bsmap_cli.slam.posegraph import Edges
+from bsmap_cli.slam.segments import Segments, extract_segments, scan_batches
 from bsmap_cli.slam.smoothing import Evidence, Smoothed, smooth
 from bsmap_cli.slam.tracking import MATCH_FLOOR, Tracking, limited, track_scans
 from bsmap_cli.slam.upkeep import with_positive_offset
@@ -53,9 +53,9 @@ def run_graph(log: ScanLog, range_sigma: float, params: SlamParams, track: Track
 def _key_segments(log: ScanLog, keys: IntArray, range_sigma: float, params: SlamParams) -> Segments:
     """Segments of the key scans; `scan` counts key scans."""
     scans = log.horizontal
-    mount = se2.from_matrix(scans.mount)
-    points = scan_points(scans.ranges[keys], scans.angles, mount, beam_motion(log)[keys])
-    return extract_segments(points, mount[:2], range_sigma, params)
+    laser = se2.from_matrix(scans.mount)[:2]
+    batches = scan_batches(scans, keys, beam_motion(log))
+    return joined([extract_segments(points, laser, range_sigma, params) for _, points in batches])
 
 
 def _odometry_edges(log: ScanLog, tracking: Tracking, chain: Edges, params: SlamParams) -> Edges:
@@ -85,7 +85,7 @@ def _unexplained(log: ScanLog, tracking: Tracking, closures: Closures, segments:
     failed = tracking.weak[chain.second]
     information[failed] = 0.0
     matches = chain._replace(information=limited(information, MATCH_FLOOR))
-    return concatenate([matches, closures.closures])
+    return joined([matches, closures.closures])
 
 
 def _every_scan(tracking: Tracking, poses: Array, known: Marginals) -> tuple[Array, Array, Array]:
@@ -132,7 +132,7 @@ def _loops(closures: Closures, tracking: Tracking) -> LoopClosures:
     """Loops between key scans as those between scans, the refused ones last."""
     parts = [take(edges, is_loop(closures.poses, edges)) for edges in (closures.closures, closures.refused)]
     held = np.repeat([True, False], [len(part.first) for part in parts])
-    found = concatenate(parts)
+    found = joined(parts)
     return LoopClosures(tracking.keys[found.first], tracking.keys[found.second], found.relative, held)
 
 

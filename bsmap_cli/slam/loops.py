@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bsmap_cli.core import se2
-from bsmap_cli.core.table import take
+from bsmap_cli.core.table import joined, take
 from bsmap_cli.model import Array
 from bsmap_cli.slam import posegraph
-from bsmap_cli.slam.matching import Match, OrientedPoints, Target, joined, make_target, match, search
+from bsmap_cli.slam.matching import Match, OrientedPoints, Target, make_target, match, search
 from bsmap_cli.slam.posegraph import Edges
 from bsmap_cli.slam.tracking import Tracking, match_noise
 from bsmap_cli.track import Track
@@ -31,6 +31,8 @@ AGREEMENT = 0.7
 SOURCE_KEYS, TARGET_KEYS = 5, 10
 """Key scans before and after that make the small maps."""
 SOURCE_POINTS = 250
+KEPT = 64
+"""Small maps that are kept for the next candidates, for neighbours ask for the same ones."""
 CLOSURE_FLOOR = (0.02, 0.02, 0.005)
 """Standard deviations of a closure beside that of the match: metres, metres, radians."""
 BOLD, SUPPORT_WAY = (0.5, 0.1), 10.0
@@ -69,7 +71,7 @@ def close_loops(tracking: Tracking, range_sigma: float, track: Track) -> Closure
     chain, closures, failed = tracking.edges, _relinks(tracking, noise), dict[tuple[int, int], Array]()
     alone = [_no_edges()]
     if len(closures.first):
-        poses = posegraph.optimise(poses, posegraph.concatenate([chain, closures])).poses
+        poses = posegraph.optimise(poses, joined([chain, closures])).poses
     wide = False
     for k in range(ROUNDS):
         track("slam: loops", k, ROUNDS)
@@ -85,23 +87,23 @@ def close_loops(tracking: Tracking, range_sigma: float, track: Track) -> Closure
             wide = True
             continue
         wide = False
-        closures = posegraph.concatenate([closures, found])
-        poses = posegraph.optimise(poses, posegraph.concatenate([chain, closures])).poses
+        closures = joined([closures, found])
+        poses = posegraph.optimise(poses, joined([chain, closures])).poses
     holds = _holding(poses, closures)
     closures, refused = take(closures, holds), take(closures, ~holds)
-    poses = posegraph.optimise(poses, posegraph.concatenate([chain, closures])).poses
+    poses = posegraph.optimise(poses, joined([chain, closures])).poses
     relocated = _relocated(tracking, poses, noise)
     if len(relocated.first):
         chain = take(chain, ~(np.isin(chain.second, relocated.second) & tracking.weak[chain.second]))
-        closures = posegraph.concatenate([closures, relocated])
-        poses = posegraph.optimise(poses, posegraph.concatenate([chain, closures])).poses
+        closures = joined([closures, relocated])
+        poses = posegraph.optimise(poses, joined([chain, closures])).poses
     track("slam: loops", ROUNDS, ROUNDS)
-    return Closures(poses, chain, closures, posegraph.concatenate([refused, _never_made(alone, closures, refused)]))
+    return Closures(poses, chain, closures, joined([refused, _never_made(alone, closures, refused)]))
 
 
 def _never_made(alone: list[Edges], *made: Edges) -> Edges:
     """The last one of each pair of key scans that no edge of `made` joins."""
-    found = posegraph.concatenate(alone)
+    found = joined(alone)
     joins = {pair for edges in made for pair in zip(edges.first.tolist(), edges.second.tolist(), strict=True)}
     pairs = zip(found.first.tolist(), found.second.tolist(), strict=True)
     last = {pair: k for k, pair in enumerate(pairs) if pair not in joins}
@@ -143,7 +145,7 @@ def _relinks(tracking: Tracking, noise: float) -> Edges:
         found = _register(source, target, se2.between(poses[before], poses[after]), noise, 1.5, 0.8)
         if found is not None:
             parts.append(_closure(before, after, found))
-    return posegraph.concatenate(parts)
+    return joined(parts)
 
 
 def _far_from(closures: Edges, way: Array) -> NDArray[np.bool_]:
@@ -173,7 +175,7 @@ def _relocated(tracking: Tracking, poses: Array, noise: float) -> Edges:
         best = max((m for m in matches if m is not None), key=lambda m: m.inliers, default=None)
         if best is not None:
             found.append(_closure(before, key, best))
-    return posegraph.concatenate(found)
+    return joined(found)
 
 
 def _find(
@@ -195,6 +197,8 @@ def _find(
         if wide is None and (before, here) in failed and _alike(guess, failed[before, here]):
             continue
         if before not in targets:
+            if len(targets) == KEPT:
+                targets.clear()
             targets[before] = _target(look, before, _around(before, TARGET_KEYS, len(look.poses)))
         source = _source(look, here, _around(here, SOURCE_KEYS, len(look.poses)))
         span = float(_reach(look.way[here] - look.way[before]))
@@ -203,7 +207,7 @@ def _find(
             failed[before, here] = guess
         else:
             found.append(_closure(before, here, closure))
-    return posegraph.concatenate(found)
+    return joined(found)
 
 
 def _alike(a: Array, b: Array) -> bool:

@@ -58,11 +58,6 @@ class Match(NamedTuple):
     rms: float
 
 
-def joined(parts: list[OrientedPoints]) -> OrientedPoints:
-    """Points of several sets in one frame."""
-    return OrientedPoints(np.concatenate([p.xy for p in parts]), np.concatenate([p.normal for p in parts]))
-
-
 def make_target(points: OrientedPoints) -> Target:
     """Target of points given in one frame."""
     return Target(points, cKDTree(points.xy, balanced_tree=False, compact_nodes=False))

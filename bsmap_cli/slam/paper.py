@@ -12,7 +12,7 @@ from bsmap_cli.slam import filter
 from bsmap_cli.slam.association import find_candidates, partial_compatibility
 from bsmap_cli.slam.filter import FilterState
 from bsmap_cli.slam.motion import Motion, beam_motion, constant_velocity, odometry_motion
-from bsmap_cli.slam.segments import Segments, extract_segments, scan_points
+from bsmap_cli.slam.segments import Segments, extract_segments, scan_batches
 from bsmap_cli.slam.upkeep import (
     Landmarks,
     append,
@@ -26,7 +26,6 @@ from bsmap_cli.slam.upkeep import (
 )
 from bsmap_cli.track import Track
 
-BATCH = 128
 """Scans whose segments are extracted at once: enough to spread the cost, few enough to stay in the cache."""
 
 
@@ -125,11 +124,8 @@ class _Motions(NamedTuple):
 def _segments(log: ScanLog, range_sigma: float, params: SlamParams) -> Iterator[Segments]:
     """Segments of each horizontal scan in turn."""
     scans = log.horizontal
-    mount = se2.from_matrix(scans.mount)
-    motion = beam_motion(log)
-    for start in range(0, len(scans.time_ns), BATCH):
-        stop = min(start + BATCH, len(scans.time_ns))
-        points = scan_points(scans.ranges[start:stop], scans.angles, mount, motion[start:stop], start)
-        found = extract_segments(points, mount[:2], range_sigma, params)
-        for k in range(start, stop):
+    laser = se2.from_matrix(scans.mount)[:2]
+    for some, points in scan_batches(scans, np.arange(len(scans.time_ns)), beam_motion(log)):
+        found = extract_segments(points, laser, range_sigma, params)
+        for k in some:
             yield found.of_scan(k)

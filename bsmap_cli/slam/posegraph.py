@@ -37,11 +37,6 @@ class Solution(NamedTuple):
     distances: Array
 
 
-def concatenate(parts: list[Edges]) -> Edges:
-    """All edges of several sets."""
-    return Edges(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
-
-
 def residuals(poses: Array, edges: Edges) -> tuple[Array, Array, Array]:
     """Errors (m, 3) of the edges and their derivatives (m, 3, 3) by the first and by the second pose."""
     a, b = poses[edges.first], poses[edges.second]

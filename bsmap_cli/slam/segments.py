@@ -3,15 +3,19 @@
 Scans are worked on many at a time: all points in one flat array, segments as ranges [start, end) of it.
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bsmap_cli.core import se2
 from bsmap_cli.core.table import take
-from bsmap_cli.model import Array, IntArray
+from bsmap_cli.model import Array, IntArray, LaserScans
 from bsmap_cli.params import SlamParams
 
+BATCH = 128
+"""Scans worked on at once."""
 MAX_MISSING = 5
 """Beams without return that a segment may bridge."""
 
@@ -69,6 +73,19 @@ def scan_points(
     xy = np.stack([moved[:, 0] + c * x - s * y, moved[:, 1] + s * x + c * y], axis=1)
     direction = np.stack([c * bx - s * by, s * bx + c * by], axis=1)
     return ScanPoints(scan + first_scan, beam, xy, direction, r, angle)
+
+
+def scan_batches(scans: LaserScans, chosen: IntArray, beam_motion: Array) -> Iterator[tuple[range, ScanPoints]]:
+    """Points of the scans `chosen` (k,), some at a time, so that long logs need no more memory than short ones.
+
+    Yields which of the chosen ones they are, and their points, whose `scan` counts the chosen ones.
+    beam_motion : (n, 3) of all scans, see `scan_points`.
+    """
+    mount = se2.from_matrix(scans.mount)
+    for start in range(0, len(chosen), BATCH):
+        some = range(start, min(start + BATCH, len(chosen)))
+        rows = chosen[start : some.stop]
+        yield some, scan_points(scans.ranges[rows], scans.angles, mount, beam_motion[rows], start)
 
 
 def extract_segments(points: ScanPoints, laser_xy: Array, range_sigma: float, params: SlamParams) -> Segments:

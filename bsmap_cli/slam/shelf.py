@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bsmap_cli.core.table import take
+from bsmap_cli.core.table import joined, take
 from bsmap_cli.model import Array
 from bsmap_cli.slam import filter
 from bsmap_cli.slam.filter import FilterState
@@ -55,7 +55,7 @@ def look_around(
         state, landmarks = discard(state, landmarks, int(line))
     for k in np.flatnonzero(near):
         state = filter.insert(state, shelf.lines[k], shelf.covariances[k])
-    landmarks = _both(landmarks, take(shelf.landmarks, near))
+    landmarks = joined([landmarks, take(shelf.landmarks, near)])
     return state, landmarks, put(take_rows(shelf, ~near), laid)
 
 
@@ -69,9 +69,5 @@ def put(shelf: Shelf, more: Shelf) -> Shelf:
     return Shelf(
         np.concatenate([shelf.lines, more.lines]),
         np.concatenate([shelf.covariances, more.covariances]),
-        _both(shelf.landmarks, more.landmarks),
+        joined([shelf.landmarks, more.landmarks]),
     )
-
-
-def _both(a: Landmarks, b: Landmarks) -> Landmarks:
-    return Landmarks(*(np.concatenate(fields) for fields in zip(a, b, strict=True)))

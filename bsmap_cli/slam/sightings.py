@@ -10,7 +10,7 @@ from bsmap_cli.model import Array, IntArray
 from bsmap_cli.slam.posegraph import ROBUST_WIDTH, Term
 from bsmap_cli.slam.segments import Segments
 
-AT_ONCE = 2000
+AT_ONCE = 400
 """Segments compared with all lines at a time."""
 PRIOR_FREEDOM = 10.0
 """Degrees of freedom with which all lines together speak for the scatter of one."""

@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bsmap_cli.core import se2
+from bsmap_cli.core.table import joined
 from bsmap_cli.model import Array, IntArray, ScanLog
 from bsmap_cli.params import SlamParams
 from bsmap_cli.slam.matching import (
     Match,
     OrientedPoints,
     Target,
-    joined,
     make_target,
     match,
     oriented_points,
@@ -22,10 +22,9 @@ from bsmap_cli.slam.matching import (
 )
 from bsmap_cli.slam.motion import Motion, beam_motion, constant_velocity, odometry_motion
 from bsmap_cli.slam.posegraph import Edges
-from bsmap_cli.slam.segments import scan_points
+from bsmap_cli.slam.segments import scan_batches
 from bsmap_cli.track import Track
 
-BATCH = 128
 WINDOW = 10
 """Key scans that make the local map: enough to reach behind a robot that sees 180 degrees."""
 GOOD, WEAK, FAR = 0.75, 0.5, 16.0
@@ -191,13 +190,10 @@ def _chain(poses: Array, information: list[Array], inliers: Array) -> Edges:
 def _points_of_scans(log: ScanLog, range_sigma: float) -> Iterator[OrientedPoints]:
     """Oriented points of each horizontal scan in turn, at most MOST_POINTS of each."""
     scans = log.horizontal
-    mount = se2.from_matrix(scans.mount)
-    motion = beam_motion(log)
-    for start in range(0, len(scans.time_ns), BATCH):
-        stop = min(start + BATCH, len(scans.time_ns))
-        points = scan_points(scans.ranges[start:stop], scans.angles, mount, motion[start:stop], start)
-        oriented, index = oriented_points(points, mount[:2], range_sigma)
-        border = np.searchsorted(points.scan[index], np.arange(start, stop + 1))
+    laser = se2.from_matrix(scans.mount)[:2]
+    for some, points in scan_batches(scans, np.arange(len(scans.time_ns)), beam_motion(log)):
+        oriented, index = oriented_points(points, laser, range_sigma)
+        border = np.searchsorted(points.scan[index], np.arange(some.start, some.stop + 1))
         for a, b in pairwise(border.tolist()):
             step = -(-(b - a) // MOST_POINTS) or 1
             yield OrientedPoints(oriented.xy[a:b:step], oriented.normal[a:b:step])

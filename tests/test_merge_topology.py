@@ -159,6 +159,29 @@ def test_larger_open_corner_stays_open():
     assert not whole_mesh(result).is_watertight
 
 
+def narrowed(surface, metres, lost):
+    """The plate without its first metres along u; without the crease `lost`."""
+    loop, P = surface.trims[0], surface.control_points
+    parameters = loop.parameters.copy()
+    parameters[[0, 3], 0] = metres / np.linalg.norm(P[1, 0] - P[0, 0])
+    return BSplineSurface(
+        **{**vars(surface), "trims": (TrimLoop(parameters, np.where(loop.creases == lost, -1, loop.creases)),)}
+    )
+
+
+@pytest.mark.parametrize(("short", "creases"), [(0.03, 12), (0.3, 11)])
+def test_edge_between_two_scans_is_found_where_both_walls_come_to_it(short, creases):
+    whole = boxed("a", LOW, HIGH)
+    names = {"a/south", "a/west"}
+    lost = next(k for k, crease in enumerate(whole.creases) if set(crease.surfaces) == names)
+    faces = tuple(narrowed(s, short, lost) if s.name in names else s for s in whole.surfaces)
+    result = merged(SurfaceMap(faces, whole.data_sets, creases=whole.creases))
+    assert len(result.creases) == creases
+    assert any(set(crease.surfaces) == names for crease in result.creases) == (short < 0.1)
+    check_creases(result)
+    assert whole_mesh(result).is_watertight == (short < 0.1)
+
+
 def test_crease_that_ends_at_a_wall_gives_its_crease_a_corner():
     """A ramp begins in the middle of a wall: the wall's lower border goes straight on, in two creases."""
     flat = plate("a/1", (0, 0, 0), (2, 0, 0), (0, 3, 0), (2, 1.5), (0, 1, -1, -1))

@@ -16,6 +16,13 @@ APART = 0.02
 STRAIGHT = 0.005
 """Metres by which a crease leaves its straight line at most, to be joined with others of the same two faces."""
 
+BESIDE = 0.01
+"""Metres from a curve within which an outline runs along it."""
+SKEW = 0.3
+"""Least sine of the angle between two faces of which no data set saw the crease."""
+
+EVERYWHERE = np.array([[-np.inf, np.inf]])
+
 FacePair = tuple[int, int]
 Fields = Mapping[int, HeightField]
 
@@ -24,13 +31,14 @@ class Curve(NamedTuple):
     """Where two faces of the map meet.
 
     points : (n, 3) of a polyline in map.  t : (n,) its length up to them, metres.  seen : (k, 2) ascending intervals of
-    t in which creases of data sets ran.
+    t in which creases of data sets ran.  beside : metres from it within which an outline runs along it.
     """
 
     pair: FacePair
     points: Array
     t: Array
     seen: Array
+    beside: float = BESIDE
 
 
 def onto(fields: Sequence[HeightField], points: Array, farthest: float = FARTHEST) -> Array:
@@ -59,6 +67,44 @@ def _straight_curve(pair: FacePair, sides: Array, fields: Fields) -> Curve:
     points = onto([fields[face] for face in pair], ends)
     seen = union(at - at.min(), APART)
     return Curve(pair, points, np.array([0.0, np.linalg.norm(points[1] - points[0])]), seen)
+
+
+def unseen_curve(
+    pair: FacePair, point: Array, outlines: Mapping[int, Sequence[Array]], fields: Fields, gap: float
+) -> Curve | None:
+    """Curve through a corner (3,) in which two faces end side by side, though no data set saw their crease.
+
+    Scans that are parallel to an edge miss it: each face then ends at the last scan before it. None where not both
+    outlines come within half of `gap` of the same part of the line in which the faces cross.
+    """
+    normals = [offset(fields[face], point[None])[1][0] for face in pair]
+    direction = np.cross(*normals)
+    if np.linalg.norm(direction) < SKEW:
+        return None
+    line = Curve(
+        pair, np.array([point, point + direction / np.linalg.norm(direction)]), np.array([0.0, 1.0]), EVERYWHERE
+    )
+    both = [_beside(line, outlines[face], gap / 2.0) for face in pair]
+    if not all(len(intervals) for intervals in both):
+        return None
+    low, high = (f([f(intervals) for intervals in both]) for f in (np.min, np.max))
+    shared = min(intervals.max() for intervals in both) - max(intervals.min() for intervals in both)
+    if shared < APART:
+        return None
+    points = place(line, np.array([low, high]), fields)
+    length = float(np.linalg.norm(points[1] - points[0]))
+    return Curve(pair, points, np.array([0.0, length]), np.array([[0.0, length]]), gap / 2.0)
+
+
+def _beside(line: Curve, loops: Sequence[Array], distance: float) -> Array:
+    """(k, 2) intervals of the line's length along which sides of loops run, within a distance."""
+    found = []
+    for loop in loops:
+        t, off = locate(line, loop)
+        ends = np.sort(np.column_stack([t, np.roll(t, -1)]), axis=1)
+        near = np.maximum(off, np.roll(off, -1)) < distance
+        found.append(ends[near & (ends[:, 1] - ends[:, 0] > APART)])
+    return np.concatenate(found)
 
 
 def main_line(points: Array) -> tuple[Array, Array]:

@@ -8,8 +8,6 @@ import numpy as np
 from bsmap_cli.merge.curves import APART, Curve, Fields, covered, locate, onto, place
 from bsmap_cli.model import Array, IntArray
 
-BESIDE = 0.01
-"""Metres from a curve within which an outline runs along it."""
 OFF = 0.005
 """Metres from a corner to the curves that end there."""
 KNOWN = 0.5
@@ -49,29 +47,32 @@ def find_runs(loop: Array, curves: Mapping[int, Curve], gap: float) -> list[Run]
     curves : those of its face under their numbers.
     gap : metres; a loop that leaves a curve by less than half of it, for less than twice of it, runs on along it.
     """
-    numbers, forward = _sides(loop, curves, gap)
-    key = np.where(numbers >= 0, 2 * numbers + forward, -1)
-    starts = np.flatnonzero(key != np.roll(key, 1))
+    along = _curves_of_sides(loop, curves, gap)
+    starts = np.flatnonzero(along != np.roll(along, 1))
     runs = []
     for start, stop in zip(starts.tolist(), np.roll(starts, -1).tolist(), strict=True):
-        if key[start] >= 0:
-            t = locate(curves[int(numbers[start])], loop[[start, stop]])[0]
-            runs.append(Run(int(numbers[start]), start, stop, float(t[0]), float(t[1])))
-    return _joined([run for run in runs if abs(run.end - run.start) > APART], loop, curves, gap)
+        if along[start] >= 0:
+            t = locate(curves[int(along[start])], loop[[start, stop]])[0]
+            runs.append(Run(int(along[start]), start, stop, float(t[0]), float(t[1])))
+    return _long(_joined(_long(runs), loop, curves, gap))
 
 
-def _sides(loop: Array, curves: Mapping[int, Curve], gap: float) -> tuple[IntArray, IntArray]:
-    """Of each side (k,) the nearest curve that it runs along, -1 for none; and 1 where it runs as the curve does."""
+def _long(runs: Sequence[Run]) -> list[Run]:
+    return [run for run in runs if abs(run.end - run.start) > APART]
+
+
+def _curves_of_sides(loop: Array, curves: Mapping[int, Curve], gap: float) -> IntArray:
+    """Of each side (k,) the nearest curve that it runs along, -1 for none."""
     length = np.linalg.norm(np.roll(loop, -1, axis=0) - loop, axis=1)
-    best, number, forward = np.full(len(loop), np.inf), np.full(len(loop), -1), np.zeros(len(loop), dtype=np.int64)
+    best, number = np.full(len(loop), np.inf), np.full(len(loop), -1)
     for k, curve in sorted(curves.items()):
         t, off = locate(curve, loop)
         t, off = np.stack([t, np.roll(t, -1)]), np.maximum(off, np.roll(off, -1))
         low, high = t.min(axis=0)[:, None], t.max(axis=0)[:, None]
         seen = np.any((curve.seen[:, 0] < high + gap) & (curve.seen[:, 1] > low - gap), axis=1)
-        along = (off < BESIDE) & (off < best) & (np.abs(t[1] - t[0]) > 0.5 * length) & seen
-        best[along], number[along], forward[along] = off[along], k, t[1, along] > t[0, along]
-    return number, forward
+        along = (off < curve.beside) & (off < best) & (np.abs(t[1] - t[0]) > 0.5 * length) & seen
+        best[along], number[along] = off[along], k
+    return number
 
 
 def _joined(runs: list[Run], loop: Array, curves: Mapping[int, Curve], gap: float) -> list[Run]:
@@ -90,9 +91,7 @@ def _joined(runs: list[Run], loop: Array, curves: Mapping[int, Curve], gap: floa
 
 
 def _runs_on(one: Run, other: Run, loop: Array, curve: Curve, gap: float) -> bool:
-    if (one.curve, one.sign) != (other.curve, other.sign) or abs(other.start - one.end) > 2.0 * gap:
-        return False
-    if (other.end - one.start) * one.sign <= 0.0:
+    if one.curve != other.curve or abs(other.start - one.end) > 2.0 * gap:
         return False
     off = locate(curve, open_part(loop, one.last, other.first))[1]
     return bool(off.max(initial=0.0) < gap / 2.0)

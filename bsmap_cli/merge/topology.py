@@ -7,6 +7,7 @@ from the creases and from what is open. A crease that ends inside another one di
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from bsmap_cli.merge.curves import Curve, FacePair, Fields, between, curves_of, locate, onto, place
+from bsmap_cli.merge.curves import Curve, FacePair, Fields, between, curves_of, locate, onto, place, unseen_curve
 from bsmap_cli.merge.runs import OFF, Meeting, Run, find_meetings, find_runs, open_part
 from bsmap_cli.model import Array, IntArray
 
@@ -93,14 +94,18 @@ def find_topology(
     """
     curves = curves_of({pair: ends for pair, ends in sides.items() if set(pair) <= outlines.keys()}, fields)
     loops = _find_loops(outlines, curves, fields, gap)
+    if unseen := _unseen_curves(loops, curves, outlines, fields, gap):
+        curves += unseen
+        loops = _find_loops(outlines, curves, fields, gap)
     corners = _find_corners(loops, fields)
     _end_near_corners(loops, curves, corners, gap)
     knots = [_find_knots(number, curve, loops, corners, fields) for number, curve in enumerate(curves)]
     edges, number_of = _find_edges(curves, knots, loops)
+    edges, kept = _shared_corners(edges)
     rings: dict[int, list[Ring]] = {face: [] for face in outlines}
     for loop in loops:
         rings[loop.face].append(_ring(loop, curves, knots, edges, number_of))
-    return Topology(rings, edges, corners.points)
+    return Topology(rings, edges, corners.points[kept])
 
 
 def _find_loops(
@@ -121,6 +126,24 @@ def _find_loops(
         meetings = find_meetings(points, runs, mine, others, fields, gap)
         loops.append(_Loop(face, points, runs, meetings, np.full((len(runs), 2), -1)))
     return loops
+
+
+def _unseen_curves(
+    loops: Sequence[_Loop],
+    curves: Sequence[Curve],
+    outlines: Mapping[int, Sequence[Array]],
+    fields: Fields,
+    gap: float,
+) -> list[Curve]:
+    """Curves of faces that meet in corners, but have none yet."""
+    known = {curve.pair for curve in curves}
+    at: dict[FacePair, Array] = {}
+    for meeting in (meeting for loop in loops for meeting in loop.meetings):
+        for pair in combinations(meeting.faces, 2):
+            if pair not in known:
+                at.setdefault(pair, meeting.point)
+    found = (unseen_curve(pair, at[pair], outlines, fields, gap) for pair in sorted(at))
+    return [curve for curve in found if curve is not None]
 
 
 def _find_corners(loops: Sequence[_Loop], fields: Fields) -> _Corners:
@@ -207,6 +230,18 @@ def _find_edges(
     return edges, number_of
 
 
+def _shared_corners(edges: Sequence[Edge]) -> tuple[list[Edge], IntArray]:
+    """The edges, their corners numbered anew: only those in which several end stay, whose old numbers come, too."""
+    ends = np.array([edge.corners for edge in edges], dtype=np.int64).reshape(-1, 2)
+    numbers, count = np.unique(ends[ends >= 0], return_counts=True)
+    kept = numbers[count > 1]
+    new = {int(corner): number for number, corner in enumerate(kept)} | {-1: -1}
+    return [
+        edge._replace(corners=(new.get(a, -1), new.get(b, -1)))
+        for edge, (a, b) in zip(edges, ends.tolist(), strict=True)
+    ], kept
+
+
 def _ring(
     loop: _Loop,
     curves: Sequence[Curve],
@@ -232,6 +267,18 @@ def _ring(
         if k not in met:
             following = loop.runs[(k + 1) % len(loop.runs)]
             way = open_part(loop.points, run.last, following.first)[1:-1]
-            points.append(np.concatenate([own.points[end : end + 1], way]))
-            numbers += [-1] * (len(way) + 1)
+            way = _off_run(way, curves[run.curve], own.t[end], run.sign)
+            start = _between_knots(loop, (k + 1) % len(loop.runs), knots[following.curve])[0]
+            back = _off_run(way[::-1], curves[following.curve], knots[following.curve].t[start], -following.sign)
+            points.append(np.concatenate([own.points[end : end + 1], back[::-1]]))
+            numbers += [-1] * (len(back) + 1)
     return Ring(np.concatenate(points).reshape(-1, 3), np.array(numbers))
+
+
+def _off_run(way: Array, curve: Curve, end: float, sign: int) -> Array:
+    """The way (k, 3) on from the end of a run, without what of its beginning doubles back along the run."""
+    if not len(way):
+        return way
+    t, off = locate(curve, way)
+    on = (off < curve.beside) & ((t - end) * sign <= 0.0)
+    return way[len(way) if on.all() else int(np.argmin(on)) :]

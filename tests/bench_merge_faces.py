@@ -8,6 +8,11 @@ what cells at corners hold of two faces); doubled: area that another face covers
 mean, 95%, max: millimetres of samples of the map to the true scene, laid over it by the first pose and by the whole
 trajectory. hit: share of the beams' true ends within 2 cm of the map.
 bytes: of the map as .json.gz over 12 bytes a point of the cloud.
+
+Creases of the merged map: T: corners in which the border of a face goes straight on. gap: largest distance of a vertex
+of a face's mesh along a crease to the nearest one of the other face. edges: of the true scene, samples with ends of
+beams within 8 cm on both sides; share within 2 cm of a crease, and median distance, of the map laid over the scene by
+the trajectory. Before: the creases of all data sets.
 """
 
 import sys
@@ -19,11 +24,13 @@ from pathlib import Path
 import numpy as np
 from scenes import simulated, true_slam_map
 from scipy.spatial import cKDTree
+from true_edges import distance_to_lines, seen_edges
 
 from bsmap_cli import open3d_loader
 from bsmap_cli.cloud import make_cloud
+from bsmap_cli.core.bspline import evaluate_surface
 from bsmap_cli.evaluate import align, distance_to_mesh, surface_samples, transform_points
-from bsmap_cli.export.tessellation import tessellate
+from bsmap_cli.export.tessellation import tessellate_map
 from bsmap_cli.fit import divide, fit_surfaces
 from bsmap_cli.fit.beams import make_grid
 from bsmap_cli.io.surfaces_json import write_surfaces
@@ -119,7 +126,7 @@ def row(name, surface_map, simulation, cloud, poses, ends):
     for pose in poses:
         d = 1e3 * distance_to_mesh(transform_points(pose, samples), simulation.vertices, simulation.triangles)
         figures.append(f"{d.mean():6.2f} {np.quantile(d, 0.95):6.2f} {d.max():5.0f}")
-    meshes = [tessellate(surface, 0.002) for surface in surface_map.surfaces]
+    meshes = tessellate_map(surface_map, 0.002)
     total, doubled = areas(meshes)
     offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
     vertices = transform_points(poses[-1], np.concatenate([mesh.vertices for mesh in meshes]))
@@ -133,6 +140,52 @@ def row(name, surface_map, simulation, cloud, poses, ends):
         f" {hit:7.2%} {share:7.3%}",
         flush=True,
     )
+
+
+def free_ends(surface_map):
+    return sum(corner < 0 for crease in surface_map.creases for corner in crease.corners)
+
+
+def straight_corners(surface_map):
+    """Corners in which the border of a face goes on within ten degrees."""
+    found = set()
+    for surface in surface_map.surfaces:
+        for loop in surface.trims:
+            at = evaluate_surface(surface, *loop.parameters.T)
+            ways = np.roll(at, -1, axis=0) - at
+            ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-12)
+            turn = np.sum(ways * np.roll(ways, 1, axis=0), axis=1)
+            both = (loop.creases >= 0) & (np.roll(loop.creases, 1) >= 0) & (loop.creases != np.roll(loop.creases, 1))
+            for k in np.flatnonzero(both & (turn > np.cos(np.radians(10.0)))):
+                pair = [surface_map.creases[c].corners for c in (loop.creases[k - 1], loop.creases[k])]
+                found |= {corner for corner in pair[0] if corner >= 0 and corner in pair[1]}
+    return len(found)
+
+
+def along(mesh, points):
+    """Vertices (k, 3) of the edges at the border of a mesh that run along a polyline."""
+    edges = np.sort(np.concatenate([mesh.triangles[:, k] for k in ([0, 1], [1, 2], [2, 0])]), axis=1)
+    single, count = np.unique(edges, axis=0, return_counts=True)
+    single = single[count == 1]
+    near = distance_to_lines(mesh.vertices, [points]) < 1e-3
+    return mesh.vertices[np.unique(single[near[single].all(axis=1)])]
+
+
+def largest_gap(surface_map):
+    """Metres, between the vertices that both faces have along a crease."""
+    meshes = dict(zip([s.name for s in surface_map.surfaces], tessellate_map(surface_map, 0.002), strict=True))
+    worst = 0.0
+    for crease in surface_map.creases:
+        a, b = (along(meshes[name], crease.points) for name in crease.surfaces)
+        if not len(a) or not len(b):
+            return np.inf
+        worst = max(worst, cKDTree(a).query(b)[0].max(), cKDTree(b).query(a)[0].max())
+    return worst
+
+
+def edge_figures(surface_map, samples, pose):
+    d = distance_to_lines(samples, [transform_points(pose, crease.points) for crease in surface_map.creases])
+    return f"edges {np.mean(d < 0.02):.2%}, median {1e3 * np.median(d):.2f} mm"
 
 
 def true_cloud(scene, seed):
@@ -157,6 +210,12 @@ def bench(scene, seed, true_poses):
     row(name, fitted, simulation, cloud, poses, ends)
     row("  merged", merged, simulation, cloud, poses, ends)
     reasons = Counter(d.outcome if d.outcome == "merged" else d.reason.split(" and ")[0] for d in merged.decisions)
+    edges = seen_edges(simulation.vertices, simulation.triangles, ends)
+    print(
+        f"  creases {len(fitted.creases)} -> {len(merged.creases)}, corners {len(merged.corners)}"
+        f" ({straight_corners(merged)} T), free ends {free_ends(merged)}, gap {1e3 * largest_gap(merged):g} mm;"
+        f" before: {edge_figures(fitted, edges, poses[-1])}; after: {edge_figures(merged, edges, poses[-1])}"
+    )
     seen, shown = seen_area(simulation, ends), shown_area(simulation, clean, first)
     print(f"  {seconds:.2f} s; seen {seen:.1f} m2, shown {shown:.1f} m2; {dict(reasons)}; {merged.notes}", flush=True)
 

@@ -201,6 +201,23 @@ def test_crease_that_ends_at_a_wall_gives_its_crease_a_corner():
     check_creases(result)
 
 
+@pytest.mark.parametrize("thickness", [0.04, 0.2])
+def test_thin_wall_stands_in_a_gap_of_the_floor_that_is_not_closed(thickness):
+    """One data set on each side of it; the floor is one plane."""
+    sides = []
+    for name, start, end, mark in (("a", 2.0, 0.0, 0), ("b", 2.0 + thickness, 4.0, 1)):
+        seen_from = ((start + end) / 2, 1.5)
+        sides.append(plate(f"{name}/1", (start, 0, 0), (end - start, 0, 0), (0, 3, 0), seen_from, (-1, -1, -1, mark)))
+        sides.append(plate(f"{name}/2", (start, 0, 0), (0, 3, 0), (0, 0, 2), seen_from, (mark, -1, -1, -1)))
+    creases = [
+        Crease((f"{name}/1", f"{name}/2"), np.array([[x, 0.0, 0.0], [x, 3.0, 0.0]]))
+        for name, x in (("a", 2.0), ("b", 2.0 + thickness))
+    ]
+    result = merged(map_of(*sides, creases=creases))
+    assert len(result.creases) == 2
+    check_creases(result, 2e-5)  # the floor is not made larger for less
+
+
 @cache
 def room():
     place = simulated_place("room")

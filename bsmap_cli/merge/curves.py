@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from bsmap_cli.fit.heights import HeightField, offset
 from bsmap_cli.model import Array
 
+SETTLED = 1e-9
+"""Metres; a step below this is the last one."""
 FARTHEST = 0.05
 """Metres by which a point is moved onto surfaces at most."""
 APART = 0.02
@@ -51,6 +53,8 @@ def onto(fields: Sequence[HeightField], points: Array, farthest: float = FARTHES
         # Surfaces that are nearly parallel do not tell where along them they meet.
         steps = np.linalg.pinv(normals, rcond=0.1) @ heights[..., None]
         out = out - steps[..., 0]
+        if np.abs(steps).max(initial=0.0) < SETTLED:
+            break
     far = np.linalg.norm(out - points, axis=1) > farthest
     return np.where(far[:, None], points, out)
 

@@ -59,7 +59,9 @@ def outline(members: Sequence[Member], sets: Sequence[str], field: HeightField, 
     by_set: dict[str, list[Region]] = defaultdict(list)
     for name, loops in zip(sets, flat, strict=True):
         by_set[name].append(region_of(loops))
-    whole = united([shapely.union_all(regions) for _, regions in sorted(by_set.items())], gap)
+    creases = np.concatenate([np.zeros((0, 2, 3)), *creased_sides(members).values()])
+    regions = [shapely.union_all(some) for _, some in sorted(by_set.items())]
+    whole = united(regions, gap, field.base.local(creases)[..., :2])
     loops = []
     for ring in loops_of(whole, TOLERANCE):
         st = _following(ring, field)

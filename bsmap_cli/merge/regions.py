@@ -14,6 +14,11 @@ GRID = 1e-5
 LEAST_AREA = 4e-4
 """Square metres; smaller parts and holes are dropped."""
 
+ALONG = 0.001
+"""Metres from a crease within which the border of a gap runs along it."""
+
+NO_SIDES = np.zeros((0, 2, 2))
+
 Region = Any  # shapely's types are not known to the type checker
 
 
@@ -27,10 +32,13 @@ def region_of(loops: Sequence[Array]) -> Region:
     return shapely.union_all(cells[winding_number(inner, loops) != 0], grid_size=GRID)
 
 
-def united(regions: Sequence[Region], gap: float) -> Region:
+def united(regions: Sequence[Region], gap: float, creases: Array = NO_SIDES) -> Region:
     """Union of the regions of several data sets, gaps between them that are narrower than `gap` closed.
 
-    What lies inside the outline of a single region is no gap: a hole that one data set saw stays open.
+    What lies inside the outline of a single region is no gap: a hole that one data set saw stays open. Nor is what lies
+    between creases: there stands a thin wall.
+
+    creases : (k, 2, 2) sides of the regions along creases.
     """
     whole = shapely.union_all(list(regions), grid_size=GRID)
     if gap > 0.0 and len(regions) > 1:
@@ -38,7 +46,9 @@ def united(regions: Sequence[Region], gap: float) -> Region:
         closed = shapely.buffer(grown, -gap / 2.0 - GRID, join_style="mitre", mitre_limit=2.0)
         holes = shapely.union_all([shapely.difference(filled(region), region) for region in regions])
         added = shapely.difference(shapely.difference(closed, whole), holes)
-        between = [part for part in parts(added) if _touched(part, regions) > 1]
+        lines = shapely.buffer(shapely.multilinestrings(creases), ALONG)
+        shapely.prepare(lines)
+        between = [part for part in parts(added) if _touched(part, regions) > 1 and not _between(part, lines)]
         whole = shapely.union_all([whole, *between], grid_size=GRID)
     return _without_specks(whole)
 
@@ -51,6 +61,10 @@ def filled(region: Region) -> Region:
 def parts(region: Region) -> list[Region]:
     """Polygons of a region."""
     return [part for part in shapely.get_parts(region) if part.geom_type == "Polygon" and not part.is_empty]
+
+
+def _between(part: Region, creases: Region) -> bool:
+    return bool(shapely.intersection(part.boundary, creases).length > part.length / 2.0)
 
 
 def _touched(part: Region, regions: Sequence[Region]) -> int:

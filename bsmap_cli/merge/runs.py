@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bsmap_cli.merge.curves import APART, Curve, Fields, covered, locate, onto, place
+from bsmap_cli.merge.curves import APART, Curve, Fields, covered, locate, onto
 from bsmap_cli.model import Array, IntArray
 
 OFF = 0.005
@@ -118,33 +118,26 @@ def find_meetings(
     for k, one in enumerate(runs):
         following = (k + 1) % len(runs)
         other = runs[following]
-        if one.curve == other.curve:
+        ends = loop[[one.last, other.first]]
+        if one.curve == other.curve or np.linalg.norm(ends[1] - ends[0]) > 2.0 * KNOWN:
             continue
         faces = tuple(sorted({*curves[one.curve].pair, *curves[other.curve].pair}))
-        way = open_part(loop, one.last, other.first)
-        ends = np.concatenate(
-            [place(curves[r.curve], np.array([t]), fields) for r, t in ((one, one.end), (other, other.start))]
-        )
         point = onto([fields[face] for face in faces], ends.mean(axis=0)[None], KNOWN)
         reach = np.linalg.norm(ends - point, axis=1).max() + gap / 2.0
-        if np.linalg.norm(way - point, axis=1).max() > reach:
-            continue
-        missing = _missing(one, True, curves[one.curve], point), _missing(other, False, curves[other.curve], point)
-        if all(
-            part is not None and _small(part, others[r.curve], gap)
-            for part, r in zip(missing, (one, other), strict=True)
+        away = np.linalg.norm(open_part(loop, one.last, other.first) - point, axis=1).max()
+        if away < reach and all(
+            _comes_to(point, end, curves[number], others[number], gap)
+            for number, end in ((one.curve, one.end), (other.curve, other.start))
         ):
             out.append(Meeting(k, following, faces, point[0]))
     return out
 
 
-def _missing(run: Run, at_end: bool, curve: Curve, point: Array) -> tuple[float, float] | None:
-    """Lengths along the curve from the end, or the start, of a run to a corner (1, 3); None if that is not on it."""
+def _comes_to(point: Array, end: float, curve: Curve, other: Array, gap: float) -> bool:
+    """Whether a corner (1, 3) lies on the curve of a run, and what lies between is short or the other face is there.
+
+    end : where along the curve the run begins or ends.
+    """
     t, off = (float(value[0]) for value in locate(curve, point))
-    return (run.end if at_end else run.start, t) if off < OFF else None
-
-
-def _small(missing: tuple[float, float], other: Array, gap: float) -> bool:
-    """Whether what lies between an end of a run and a corner is short, or the other face runs along it."""
-    low, high = sorted(missing)
-    return high - low < (KNOWN if covered(other, low, high, gap) else 2.0 * gap)
+    low, high = sorted((t, end))
+    return off < OFF and high - low < (KNOWN if covered(other, low, high, gap) else 2.0 * gap)

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from face_maps import SIGMA, bow, bowed, floor, map_of, wall, with_crease
 from face_scenes import simulated_place
+from scenes import simulated
 
+from bsmap_cli.cloud import make_cloud
 from bsmap_cli.core.bspline import evaluate_surface
 from bsmap_cli.core.trims import inside_trims
 from bsmap_cli.core.uncertainty import sensor_covariance, surface_covariance
@@ -19,7 +21,8 @@ from bsmap_cli.merge import merge_surfaces
 from bsmap_cli.merge.planar import planar_face
 from bsmap_cli.merge.regions import region_of, united
 from bsmap_cli.model import SurfaceMap
-from bsmap_cli.params import FitParams, MergeParams
+from bsmap_cli.params import CloudParams, FitParams, MergeParams, SlamParams
+from bsmap_cli.slam import run_slam
 
 
 def merged(*surfaces, **params):
@@ -185,7 +188,7 @@ def test_twice_the_same_map_gives_one_map_of_it_all():
     parts = [wall("a/1", 0.0, 4.0), floor("a/2", 0.0, 4.0)]
     result = merge_surfaces([map_of(*parts), map_of(*parts)], MergeParams())
     assert len(result.surfaces) == 2
-    assert {name for s in result.surfaces for name in s.data_sets} == {"1.a", "2.a"}
+    assert {name for s in result.surfaces for name in s.data_sets} == {"a", "2.a"}
 
 
 @cache
@@ -215,22 +218,70 @@ def test_room_is_there_once_and_as_true_as_before():
     assert np.quantile(after, 0.95) < 1.5e-3
 
 
-def test_shuffled_input_gives_the_same_map():
-    _, fitted = room()
-    order = np.random.default_rng(0).permutation(len(fitted.surfaces))
-    shuffled = SurfaceMap(
-        tuple(fitted.surfaces[k] for k in order), fitted.data_sets[::-1], creases=fitted.creases, notes=fitted.notes
+@cache
+def room_by_slam():
+    """Faces of the room at poses of our own slam, so that data sets have errors of pose to correct."""
+    slam_map = run_slam(simulated("room").log, SlamParams())
+    return fit_surfaces(make_cloud(slam_map, CloudParams()), FitParams(method="faces"))
+
+
+def part_of(whole, data_sets, rng):
+    """The map of some of its data sets, everything in it shuffled."""
+    surfaces = [s for s in whole.surfaces if set(s.data_sets) <= set(data_sets)]
+    names = {s.name for s in surfaces}
+    kept = [k for k in rng.permutation(len(whole.creases)) if names.issuperset(whole.creases[k].surfaces)]
+    number = np.full(len(whole.creases) + 1, -1)
+    number[kept] = np.arange(len(kept))
+    surfaces = [replace(s, trims=tuple(replace(t, creases=number[t.creases]) for t in s.trims)) for s in surfaces]
+    sets = [d for d in whole.data_sets if d.name in data_sets]
+    return SurfaceMap(
+        tuple(surfaces[k] for k in rng.permutation(len(surfaces))),
+        tuple(sets[k] for k in rng.permutation(len(sets))),
+        creases=tuple(whole.creases[k] for k in kept),
     )
-    one, other = (merge_surfaces([m], MergeParams()) for m in (fitted, shuffled))
+
+
+def test_order_of_maps_and_of_all_in_them_does_not_matter():
+    whole = room_by_slam()
+    names = [d.name for d in whole.data_sets]
+    made = []
+    for seed, turn in ((0, 1), (1, -1), (2, -1)):
+        rng = np.random.default_rng(seed)
+        maps = [part_of(whole, names[:4], rng), part_of(whole, names[4:], rng)]
+        made.append(merge_surfaces(maps[::turn], MergeParams()))
+    assert made[0].notes["largest_correction"] > 1e-4
+    assert_same(made[0], made[1])
+    assert_same(made[0], made[2])
+
+
+def test_order_does_not_matter_where_maps_share_their_names():
+    whole = room_by_slam()
+    names = [d.name for d in whole.data_sets]
+    rng = np.random.default_rng(0)
+    maps = [part_of(whole, names[:3], rng), part_of(whole, names[1:4], rng)]
+    one, other = (merge_surfaces(maps[::turn], MergeParams()) for turn in (1, -1))
+    assert len(one.data_sets) == 6
+    assert_same(one, other)
+
+
+def assert_same(one, other):
+    """Maps that are the same to 1e-9, names included."""
     assert [s.name for s in one.surfaces] == [s.name for s in other.surfaces]
+    assert [d.name for d in one.data_sets] == [d.name for d in other.data_sets]
     for a, b in zip(one.surfaces, other.surfaces, strict=True):
-        np.testing.assert_allclose(a.control_points, b.control_points, atol=1e-9)
-        np.testing.assert_allclose(a.covariance.matrix, b.covariance.matrix, atol=1e-15)
-        assert len(a.trims) == len(b.trims)
+        assert a.data_sets == b.data_sets
+        np.testing.assert_allclose(a.control_points, b.control_points, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(a.covariance.matrix, b.covariance.matrix, rtol=1e-6, atol=1e-15)
+        for p, q in zip(a.covariance.pose, b.covariance.pose, strict=True):
+            assert p.data_set == q.data_set
+            assert p.weight == pytest.approx(q.weight, abs=1e-9)
         for p, q in zip(a.trims, b.trims, strict=True):
-            np.testing.assert_allclose(p.parameters, q.parameters, atol=1e-9)
+            np.testing.assert_allclose(p.parameters, q.parameters, rtol=0, atol=1e-9)
+            np.testing.assert_array_equal(p.creases, q.creases)
+    assert one.decisions == other.decisions
     for a, b in zip(one.creases, other.creases, strict=True):
-        np.testing.assert_allclose(a.points, b.points, atol=1e-9)
+        assert a.surfaces == b.surfaces
+        np.testing.assert_allclose(a.points, b.points, rtol=0, atol=1e-9)
 
 
 def test_merged_faces_are_written_and_read(tmp_path):

@@ -196,10 +196,10 @@ def test_order_of_two_surfaces_does_not_matter() -> None:
 def test_names_of_several_maps_stay_unique() -> None:
     first, second = map_of(wall("a", 0, 4)), map_of(wall("a", 2, 6))
     result = merge_surfaces([first, second], PARAMS)
-    assert {data_set.name for data_set in result.data_sets} == {"1.a", "2.a"}
+    assert {data_set.name for data_set in result.data_sets} == {"a", "2.a"}
     names = [surface.name for surface in result.surfaces]
     assert len(set(names)) == len(names)
-    assert {name for s in result.surfaces for name in s.data_sets} == {"1.a", "2.a"}
+    assert {name for s in result.surfaces for name in s.data_sets} == {"a", "2.a"}
     assert merge_surfaces([first, map_of(wall("b", 7, 9))], PARAMS).surfaces[1].name == "b"
 
 

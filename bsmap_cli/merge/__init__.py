@@ -44,14 +44,15 @@ def merge_surfaces(maps: Sequence[SurfaceMap], params: MergeParams, *, track: Tr
 
     Parameters
     ----------
-    maps : surface maps in one frame `map`; where names clash, all get the number of their map in front.
+    maps : surface maps in one frame `map`, in any order; where names clash, those of the smaller map get a number in
+    front.
 
     Returns
     -------
     SurfaceMap of all merged and all other patches, with a decision for every pair that meets. Trimmed surfaces (faces)
     are joined whole, see `merge.faces`.
     """
-    united = unite(maps)
+    united, _ = unite(maps)
     surfaces, trimmed = separate_faces(united.surfaces)
     faces = merge_faces(trimmed, united.creases, params, track=track) if trimmed else no_faces()
     taken = {surface.name for surface in united.surfaces}

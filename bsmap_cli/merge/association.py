@@ -1,6 +1,8 @@
 """Which faces of different data sets are one and the same: pairs that agree, joined strongest first."""
 
+from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -35,7 +37,7 @@ class Pair(NamedTuple):
 
 
 def associate(faces: Sequence[PlanarFace], params: MergeParams) -> tuple[list[list[int]], list[Decision]]:
-    """Groups of faces, each one physical face, and decisions about all pairs that met.
+    """Groups of faces, each one physical face, and decisions: of each joining, and of two groups why they stay apart.
 
     Pairs of the same data set are never joined directly, and no two groups that hold such a pair at an offset.
     """
@@ -47,7 +49,7 @@ def associate(faces: Sequence[PlanarFace], params: MergeParams) -> tuple[list[li
     for pair in pairs:
         if pair.opposite or pair.offset > params.distance or pair.distance > gate * (1.0 if pair.same else FAR_OFF):
             apart[pair.first][pair.second] = apart[pair.second][pair.first] = pair
-    decisions = []
+    joined, refused = [], []
     for pair in sorted(pairs, key=lambda p: (-p.area, p.distance, p.first, p.second)):
         reason = _refusal(pair, gate, params)
         a, b = group[pair.first], group[pair.second]
@@ -62,9 +64,24 @@ def associate(faces: Sequence[PlanarFace], params: MergeParams) -> tuple[list[li
                 for m in members[small]:
                     group[m] = large
                 members[large] += members.pop(small)
-        if not pair.same or pair.opposite:
-            decisions.append(_decision(faces, pair, reason))
+                joined.append(_decision(faces, pair, None))
+        if reason is not None and (not pair.same or pair.opposite):
+            refused.append((pair, reason))
+    decisions = [*joined, *_refusals(faces, refused, group)]
     return [sorted(found) for found in sorted(members.values(), key=min)], decisions
+
+
+def _refusals(faces: Sequence[PlanarFace], refused: Sequence[tuple[Pair, str]], group: Sequence[int]) -> list[Decision]:
+    """Of each two groups (or within one) the refusal of the strongest pair, and of how many pairs it speaks."""
+    between: dict[tuple[int, int], list[tuple[Pair, str]]] = defaultdict(list)
+    for pair, reason in refused:
+        a, b = sorted((group[pair.first], group[pair.second]))
+        between[a, b].append((pair, reason))
+    out = []
+    for found in between.values():
+        strongest = _decision(faces, *found[0])
+        out.append(replace(strongest, figures=strongest.figures | {"pairs": float(len(found))}))
+    return out
 
 
 def _refusal(pair: Pair, gate: float, params: MergeParams) -> str | None:

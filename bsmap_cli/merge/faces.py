@@ -30,6 +30,9 @@ from bsmap_cli.model import (
 from bsmap_cli.params import MergeParams
 from bsmap_cli.track import Track, silent
 
+JOINED = "face-"
+"""Names of joined faces begin with it."""
+
 
 class MergedFaces(NamedTuple):
     """Faces of the map, their creases and corners (k, 3), what was decided, and figures for the notes."""
@@ -171,18 +174,24 @@ def _without_creases(surface: BSplineSurface) -> BSplineSurface:
 
 
 def _names(groups: Sequence[_Group], others: Sequence[BSplineSurface]) -> dict[int, str]:
-    """Faces on their own keep their name; joined ones are numbered, the largest first."""
+    """Faces on their own keep their name, and joined ones that of the largest that was joined before; others are
+    numbered, the largest first.
+    """
     out = {number: group.faces[0].surface.name for number, group in enumerate(groups)}
     out |= {len(groups) + k: surface.name for k, surface in enumerate(others)}
     joined = [number for number, group in enumerate(groups) if group.joined]
     joined.sort(key=lambda number: (-sum(face.area for face in groups[number].faces), number))
-    taken = {out[number] for number in out if number not in joined}
+    taken = {face.surface.name for group in groups for face in group.faces} | {surface.name for surface in others}
     count = 0
     for number in joined:
+        before = [face for face in groups[number].faces if face.surface.name.startswith(JOINED)]
+        if before:
+            out[number] = max(before, key=lambda face: face.area).surface.name
+            continue
         count += 1
-        while f"face-{count:03d}" in taken:
+        while f"{JOINED}{count:03d}" in taken:
             count += 1
-        out[number] = f"face-{count:03d}"
+        out[number] = f"{JOINED}{count:03d}"
     return out
 
 

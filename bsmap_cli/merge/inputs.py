@@ -1,40 +1,69 @@
 """Several maps as one: names of data sets and surfaces stay unique."""
 
-from collections import Counter
-from collections.abc import Iterable, Sequence
+import itertools
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from bsmap_cli.model import BSplineSurface, Crease, HeightCovariance, SurfaceMap, TrimLoop
+from bsmap_cli.model import Array, BSplineSurface, Crease, DataSet, Decision, HeightCovariance, SurfaceMap, TrimLoop
 
 
-def unite(maps: Sequence[SurfaceMap]) -> SurfaceMap:
-    """Surfaces, creases, data sets and former decisions of all maps in one.
+class United(NamedTuple):
+    """All maps in one.  survey : number of the map that each surface stems from, by name."""
 
-    Where maps share a name, every name gets its map's number (from 1) in front.
+    whole: SurfaceMap
+    survey: dict[str, int]
+
+
+def unite(maps: Sequence[SurfaceMap]) -> United:
+    """Surfaces, creases and data sets of all maps in one.
+
+    Maps are taken in an order of their own, those of most data sets first (an old map before a new survey), so that
+    the order in which they are given does not matter. The first keeps its names; where another one has a name that
+    is taken, all its names get a number in front, from 2 on. Former decisions about pairs stay in their own artifacts.
     """
-    if _clash([surface.name for surface in m.surfaces] for m in maps) or _clash(
-        [data_set.name for data_set in m.data_sets] for m in maps
-    ):
-        maps = [_prefixed(m, f"{number}.") for number, m in enumerate(maps, start=1)]
     surfaces: list[BSplineSurface] = []
     creases: list[Crease] = []
-    corners = 0
-    for m in maps:
+    data_sets: list[DataSet] = []
+    decisions: list[Decision] = []
+    survey: dict[str, int] = {}
+    corners: list[Array] = [np.zeros((0, 3))]
+    for number, given in enumerate(sorted(maps, key=_order)):
+        m = _named_apart(given, survey.keys(), {data_set.name for data_set in data_sets})
         surfaces += [_renumbered(surface, len(creases)) for surface in m.surfaces]
-        creases += [_with_corners_from(crease, corners) for crease in m.creases]
-        corners += len(m.corners)
-    data_sets = tuple(data_set for m in maps for data_set in m.data_sets)
-    decisions = tuple(decision for m in maps for decision in m.decisions)
-    of_all = np.concatenate([m.corners for m in maps])
-    return SurfaceMap(tuple(surfaces), data_sets, decisions, {}, tuple(creases), of_all)
+        creases += [_with_corners_from(crease, sum(map(len, corners))) for crease in m.creases]
+        corners.append(m.corners)
+        data_sets += sorted(m.data_sets, key=lambda data_set: data_set.name)
+        decisions += [decision for decision in m.decisions if decision.first and not decision.second]
+        survey |= {surface.name: number for surface in m.surfaces}
+    whole = SurfaceMap(tuple(surfaces), tuple(data_sets), tuple(decisions), {}, tuple(creases), np.concatenate(corners))
+    return United(whole, survey)
 
 
 def _with_corners_from(crease: Crease, start: int) -> Crease:
     """The crease, its corners counted from `start`."""
     first, last = (corner + start if corner >= 0 else -1 for corner in crease.corners)
     return replace(crease, corners=(first, last))
+
+
+def _order(m: SurfaceMap) -> tuple[int, int, int, list[list[float]]]:
+    """Sorts by extent, then by content: names and order inside the map do not matter."""
+    shapes = sorted(surface.control_points.ravel().round(9).tolist() for surface in m.surfaces)
+    return -len(m.data_sets), len(m.surfaces), -sum(data_set.points for data_set in m.data_sets), shapes
+
+
+def _named_apart(m: SurfaceMap, surfaces: Collection[str], data_sets: Collection[str]) -> SurfaceMap:
+    """The map, its names told from those taken by surfaces and data sets."""
+    own = [surface.name for surface in m.surfaces], [data_set.name for data_set in m.data_sets]
+    prefixes = itertools.chain([""], (f"{number}." for number in itertools.count(2)))
+    prefix = next(
+        p
+        for p in prefixes
+        if not any(p + name in taken for names, taken in zip(own, (surfaces, data_sets), strict=True) for name in names)
+    )
+    return _prefixed(m, prefix) if prefix else m
 
 
 def _renumbered(surface: BSplineSurface, first: int) -> BSplineSurface:
@@ -53,11 +82,6 @@ def separate_faces(surfaces: Iterable[BSplineSurface]) -> tuple[list[BSplineSurf
         trimmed = bool(surface.trims) or isinstance(surface.covariance, HeightCovariance)
         (faces if trimmed else whole).append(surface)
     return whole, faces
-
-
-def _clash(names: Iterable[Sequence[str]]) -> bool:
-    counts = Counter(name for of_map in names for name in set(of_map))
-    return any(count > 1 for count in counts.values())
 
 
 def _prefixed(m: SurfaceMap, prefix: str) -> SurfaceMap:

@@ -1,5 +1,6 @@
 """What growing regions needs to know of the pieces: their block means, own chi square, and neighbours."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -43,7 +44,7 @@ class Context(NamedTuple):
         """Chi square a beam that a joint surface may be worse."""
         return max(SLACK, (FLATNESS / self.sigma) ** 2)
 
-    def blocks_of(self, members: list[int]) -> Blocks:
+    def blocks_of(self, members: Sequence[int]) -> Blocks:
         """Blocks of the pieces `members`."""
         return self.blocks.pick(np.concatenate([np.arange(self.first[k], self.first[k + 1]) for k in members]))
 

@@ -1,5 +1,6 @@
 """Regions joined while the joint criterion falls: parts of a face behind an obstacle, parts of a curved one."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +22,7 @@ NEAR = 1.5
 
 
 class _Region(NamedTuple):
-    members: list[int]
+    members: tuple[int, ...]
     blocks: Blocks
     frame: PlaneFrame
     cost: float
@@ -33,26 +34,29 @@ def unite_regions(context: Context, regions: list[list[int]]) -> list[list[int]]
     """Join regions while the joint criterion falls: parts of a face behind an obstacle, parts of a curved one."""
     found = [_region(context, members) for members in regions]
     found.sort(key=lambda r: -float(r.blocks.counts.sum()))
+    apart: set[tuple[tuple[int, ...], tuple[int, ...]]] = set()
     k = 0
     while k < len(found):
         for other in range(len(found) - 1, k, -1):
-            joint = _joined(context, found[k], found[other])
+            pair = found[k].members, found[other].members
+            joint = _joined(context, found[k], found[other]) if pair not in apart else None
             if joint is not None:
                 found[k] = joint
                 del found[other]
                 k = -1
                 break
+            apart.add(pair)
         k += 1
     found.sort(key=lambda r: -float(r.blocks.counts.sum()))
-    return [region.members for region in found]
+    return [list(region.members) for region in found]
 
 
-def _region(context: Context, members: list[int]) -> _Region:
+def _region(context: Context, members: Sequence[int]) -> _Region:
     blocks = context.blocks_of(members)
     frame = fit_plane_frame(blocks)
     box = np.array([blocks.points.min(axis=0), blocks.points.max(axis=0)])
     cost, is_round = low_order_cost(blocks, frame, context.sigma)
-    return _Region(members, blocks, frame, cost, box, is_round)
+    return _Region(tuple(members), blocks, frame, cost, box, is_round)
 
 
 class LowOrder(NamedTuple):

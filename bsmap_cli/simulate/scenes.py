@@ -7,6 +7,7 @@ import numpy as np
 
 from bsmap_cli.model import Array
 from bsmap_cli.simulate.geometry import Cut, Mesh, arc, carve, join, room, solid, upright
+from bsmap_cli.simulate.office import office_cuts, office_way
 from bsmap_cli.simulate.path import Path, along, stepwise
 
 DOOR = 2.05  # m, height of doorways
@@ -189,10 +190,16 @@ def steps_scene() -> Scene:
     return Scene(mesh, along(waypoints, radius=0.7, speed=0.4))
 
 
+def office_scene() -> Scene:
+    """Floor of offices, 72 m by 50 m, its corridors driven through for 1 km in many loops; 0.7 m/s."""
+    return Scene(carve(office_cuts()), along(np.array(office_way()), radius=0.9, speed=0.7))
+
+
 SCENES: dict[str, Callable[[], Scene]] = {
     "room": room_scene,
     "corridor": corridor_scene,
     "loop": loop_scene,
     "walls": walls_scene,
     "steps": steps_scene,
+    "office": office_scene,
 }

@@ -38,6 +38,8 @@ from bsmap_cli.merge import merge_surfaces
 from bsmap_cli.params import CloudParams, FitParams, MergeParams, SlamParams
 from bsmap_cli.slam import run_slam
 
+NEAR = 0.002
+"""Metres from a crease to the vertices of a mesh that lie along it."""
 DENSITY = 400.0
 """Samples a square metre for areas."""
 
@@ -163,12 +165,15 @@ def straight_corners(surface_map):
 
 
 def along(mesh, points):
-    """Vertices (k, 3) of the edges at the border of a mesh that run along a polyline."""
+    """Vertices (k, 3) at the border of a mesh that lie along a polyline, at its ends only those that are its ends.
+
+    An open border that begins at the end of a crease may have a vertex nearby.
+    """
     edges = np.sort(np.concatenate([mesh.triangles[:, k] for k in ([0, 1], [1, 2], [2, 0])]), axis=1)
     single, count = np.unique(edges, axis=0, return_counts=True)
-    single = single[count == 1]
-    near = distance_to_lines(mesh.vertices, [points]) < 1e-3
-    return mesh.vertices[np.unique(single[near[single].all(axis=1)])]
+    border = mesh.vertices[np.unique(single[count == 1])]
+    at_end = cKDTree(points[[0, -1]]).query(border)[0]
+    return border[(distance_to_lines(border, [points]) < NEAR) & ((at_end == 0.0) | (at_end > NEAR))]
 
 
 def largest_gap(surface_map):
@@ -177,9 +182,10 @@ def largest_gap(surface_map):
     worst = 0.0
     for crease in surface_map.creases:
         a, b = (along(meshes[name], crease.points) for name in crease.surfaces)
-        if not len(a) or not len(b):
-            return np.inf
-        worst = max(worst, cKDTree(a).query(b)[0].max(), cKDTree(b).query(a)[0].max())
+        ends = [cKDTree(some).query(crease.points[[0, -1]])[0].max() if len(some) else np.inf for some in (a, b)]
+        worst = max(worst, *ends)
+        if np.isfinite(worst):
+            worst = max(worst, cKDTree(a).query(b)[0].max(), cKDTree(b).query(a)[0].max())
     return worst
 
 

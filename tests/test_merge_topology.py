@@ -1,12 +1,13 @@
 """Faces, creases and corners of a merged map are one: creases are shared, corners single, open borders stay open."""
 
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 
 import numpy as np
 import pytest
 import trimesh
-from face_maps import bowed, boxed, map_of, plate, wall
+from face_maps import bow, bowed, boxed, floor, map_of, plate, wall
 from face_scenes import simulated_place
 
 from bsmap_cli.core.bspline import evaluate_surface
@@ -199,6 +200,52 @@ def test_crease_that_ends_at_a_wall_gives_its_crease_a_corner():
     np.testing.assert_allclose(result.corners, [[2, 0, 0]], atol=1e-6)
     assert degrees(result).tolist() == [3]
     check_creases(result)
+
+
+def curved_corner(names, height=0.1, directions=None):
+    """Per data set a wall that bends by `height` over 4 m and the floor before it, and their crease of nine points."""
+    x = np.linspace(0.0, 4.0, 9)
+    line = np.column_stack([x, height * bow(x), np.zeros(9)])
+    faces, creases = [], []
+    for number, name in enumerate(names):
+        marks = np.where(np.arange(11) < 8, number, -1)
+        upright, ground = bowed(wall(f"{name}/1", 0.0, 4.0), height), floor(f"{name}/2", 0.0, 4.0)
+        if directions is not None:
+            upright = BSplineSurface(
+                **{**vars(upright), "covariance": replace(upright.covariance, directions=directions)}
+            )
+        loops = [
+            np.concatenate([np.column_stack([x / 4.0, 0.0 * x]), [[1.0, 1.0], [0.0, 1.0]]]),
+            np.concatenate([line[:, :2] / [4.0, 3.0], [[1.0, 1.0], [0.0, 1.0]]]),
+        ]
+        for surface, parameters in zip((upright, ground), loops, strict=True):
+            faces.append(BSplineSurface(**{**vars(surface), "trims": (TrimLoop(parameters, marks),)}))
+        creases.append(Crease((f"{name}/1", f"{name}/2"), line))
+    return map_of(*faces, creases=creases)
+
+
+OUTWARDS = (
+    np.array([[[0.1, 1.0, 0.0]], [[0.0, 1.0, 0.0]], [[-0.1, 1.0, 0.0]]]) / np.sqrt([1.01, 1.0, 1.01])[:, None, None]
+)
+
+
+@pytest.mark.parametrize(("names", "directions"), [("a", None), ("ab", None), ("a", OUTWARDS)])
+def test_crease_at_a_bent_wall_is_one_curve_on_both_faces(names, directions):
+    """A bowed face over a plane, of one data set and of two; and a face over another base, which is not joined."""
+    result = merged(curved_corner(names, directions=directions))
+    (crease,) = result.creases
+    x, y, z = crease.points.T
+    assert len(x) > 5
+    assert np.ptp(x) == pytest.approx(4.0, abs=1e-3)
+    np.testing.assert_allclose(z, 0.0, atol=1e-6)
+    np.testing.assert_allclose(y, 0.1 * bow(x), atol=2e-5)
+    check_creases(result, 2e-5)
+    a, b = (
+        {tuple(p) for p in mesh.vertices[mesh.vertices[:, 2] < 1e-4].tolist()} for mesh in tessellate_map(result, 2e-4)
+    )
+    far = {p for p in a | b if p[1] > 0.2}
+    assert a - far == b - far
+    assert len(a - far) > len(x)
 
 
 @pytest.mark.parametrize("thickness", [0.04, 0.2])

@@ -8,20 +8,23 @@ import numpy as np
 from bsmap_cli.core.bspline import clamped_knots, design_matrix, inner_knots
 from bsmap_cli.fit.heights import HeightField, greville
 from bsmap_cli.merge.regions import GRID
+from bsmap_cli.merge.shapes import Shape, parameters_of
 from bsmap_cli.merge.topology import Ring
 from bsmap_cli.model import Array, BSplineSurface, HeightCovariance, TrimLoop
 
 
-def trimmed(surface: BSplineSurface, rings: Sequence[Ring], field: HeightField) -> BSplineSurface:
-    """The surface with these outlines, extended where they lie beyond it.  field : that of the surface."""
-    found = [field.parameters(field.base.local(ring.points)) for ring in rings]
-    low = np.minimum(np.min([uv.min(axis=0) for uv in found], axis=0), 0.0)
-    high = np.maximum(np.max([uv.max(axis=0) for uv in found], axis=0), 1.0)
-    beyond = np.maximum(-low, high - 1.0) * (field.high - field.low)
-    if beyond.max() > 2.0 * GRID:
-        surface = extended(surface, low, high)
-    else:
-        low, high = np.zeros(2), np.ones(2)
+def trimmed(surface: BSplineSurface, rings: Sequence[Ring], shape: Shape) -> BSplineSurface:
+    """The surface with these outlines; one over a plane is extended where they lie beyond it.
+
+    shape : that of the surface.
+    """
+    found = [parameters_of(shape, ring.points) for ring in rings]
+    low, high = np.zeros(2), np.ones(2)
+    if isinstance(shape, HeightField):
+        lowest, highest = (f([f(uv, axis=0) for uv in found], axis=0) for f in (np.min, np.max))
+        if (np.maximum(-lowest, highest - 1.0) * (shape.high - shape.low)).max() > 2.0 * GRID:
+            low, high = np.minimum(lowest, 0.0), np.maximum(highest, 1.0)
+            surface = extended(surface, low, high)
     inside = (np.clip((uv - low) / (high - low), 0.0, 1.0) for uv in found)
     loops = (TrimLoop(uv, ring.edges) for uv, ring in zip(inside, rings, strict=True))
     return replace(surface, trims=tuple(loops))

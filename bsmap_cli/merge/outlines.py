@@ -10,7 +10,7 @@ import shapely
 from bsmap_cli.core.bspline import evaluate_surface
 from bsmap_cli.core.polygons import simplify
 from bsmap_cli.fit.heights import HeightField, evaluate
-from bsmap_cli.merge.curves import FacePair, Fields, onto
+from bsmap_cli.merge.curves import FacePair, Shapes, onto
 from bsmap_cli.merge.regions import Region, loops_of, region_of, united
 from bsmap_cli.model import Array, BSplineSurface
 
@@ -34,18 +34,18 @@ def member_of(surface: BSplineSurface, pairs: Sequence[FacePair | None]) -> Memb
     return Member(corners, sides)
 
 
-def snapped(member: Member, face: int, fields: Fields) -> Member:
+def snapped(member: Member, face: int, shapes: Shapes) -> Member:
     """The member, its corners at creases brought onto the surfaces of the map that meet there."""
     corners = []
     for points, sides in zip(member.corners, member.sides, strict=True):
         new = points.copy()
         by_faces = defaultdict(list)
         for k in range(len(points)):
-            met = {f for pair in (sides[k - 1], sides[k]) if pair for f in pair if f in fields}
+            met = {f for pair in (sides[k - 1], sides[k]) if pair for f in pair if f in shapes}
             if met - {face}:
                 by_faces[tuple(sorted(met | {face}))].append(k)
         for met_faces, at in by_faces.items():
-            new[at] = onto([fields[f] for f in met_faces], points[at])
+            new[at] = onto([shapes[f] for f in met_faces], points[at])
         corners.append(new)
     return Member(corners, member.sides)
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bsmap_cli.merge.curves import APART, Curve, Fields, covered, locate, onto
+from bsmap_cli.merge.curves import APART, Curve, Shapes, covered, locate, onto
 from bsmap_cli.model import Array, IntArray
 
 OFF = 0.005
@@ -107,7 +107,7 @@ def find_meetings(
     runs: Sequence[Run],
     curves: Mapping[int, Curve],
     others: Mapping[int, Array],
-    fields: Fields,
+    shapes: Shapes,
     gap: float,
 ) -> list[Meeting]:
     """Where runs of a loop that follow each other meet, as far as what lies between them is little or known.
@@ -122,7 +122,7 @@ def find_meetings(
         if one.curve == other.curve or np.linalg.norm(ends[1] - ends[0]) > 2.0 * KNOWN:
             continue
         faces = tuple(sorted({*curves[one.curve].pair, *curves[other.curve].pair}))
-        point = onto([fields[face] for face in faces], ends.mean(axis=0)[None], KNOWN)
+        point = onto([shapes[face] for face in faces], ends.mean(axis=0)[None], KNOWN)
         reach = np.linalg.norm(ends - point, axis=1).max() + gap / 2.0
         away = np.linalg.norm(open_part(loop, one.last, other.first) - point, axis=1).max()
         if away < reach and all(

@@ -6,7 +6,7 @@ from the creases and from what is open. A crease that ends inside another one di
 """
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
 from typing import NamedTuple
 
@@ -15,8 +15,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from bsmap_cli.merge.curves import Curve, FacePair, Fields, between, curves_of, locate, onto, place, unseen_curve
+from bsmap_cli.merge.curves import Curve, FacePair, Shapes, between, locate, onto, place
 from bsmap_cli.merge.runs import OFF, Meeting, Run, find_meetings, find_runs, open_part
+from bsmap_cli.merge.tracing import curves_of, unseen_curve
 from bsmap_cli.model import Array, IntArray
 
 SAME = 0.01
@@ -82,7 +83,7 @@ class _Knots(NamedTuple):
 
 
 def find_topology(
-    outlines: Mapping[int, Sequence[Array]], sides: Mapping[FacePair, Array], fields: Fields, gap: float
+    outlines: Mapping[int, Sequence[Array]], sides: Mapping[FacePair, Array], shapes: Shapes, gap: float
 ) -> Topology:
     """Edges and corners of the map, and the outlines that refer to them.
 
@@ -92,14 +93,14 @@ def find_topology(
     sides : (k, 2, 3) segments of the creases of data sets, by the faces of the map that meet in them.
     gap : metres of open border between the end of a crease and a corner that are closed.
     """
-    curves = curves_of({pair: ends for pair, ends in sides.items() if set(pair) <= outlines.keys()}, fields)
-    loops = _find_loops(outlines, curves, fields, gap)
-    if unseen := _unseen_curves(loops, curves, outlines, fields, gap):
+    curves = curves_of({pair: ends for pair, ends in sides.items() if set(pair) <= outlines.keys()}, shapes)
+    loops = _find_loops(outlines, curves, shapes, gap)
+    if unseen := _unseen_curves(loops, curves, outlines, shapes, gap):
         curves += unseen
-        loops = _find_loops(outlines, curves, fields, gap)
-    corners = _find_corners(loops, fields)
+        loops = _find_loops(outlines, curves, shapes, gap)
+    corners = _find_corners(loops, shapes)
     _end_near_corners(loops, curves, corners, gap)
-    knots = [_find_knots(number, curve, loops, corners, fields) for number, curve in enumerate(curves)]
+    knots = [_find_knots(number, curve, loops, corners, shapes) for number, curve in enumerate(curves)]
     edges, number_of = _find_edges(curves, knots, loops)
     edges, kept = _shared_corners(edges)
     rings: dict[int, list[Ring]] = {face: [] for face in outlines}
@@ -109,13 +110,14 @@ def find_topology(
 
 
 def _find_loops(
-    outlines: Mapping[int, Sequence[Array]], curves: Sequence[Curve], fields: Fields, gap: float
+    outlines: Mapping[int, Sequence[Array]], curves: Sequence[Curve], shapes: Shapes, gap: float
 ) -> list[_Loop]:
     """All loops with their runs and where these meet."""
     found, spans = [], defaultdict(list)
     for face in sorted(outlines):
         mine = {k: curve for k, curve in enumerate(curves) if face in curve.pair}
-        for points in outlines[face]:
+        wide = [points for points in outlines[face] if not _is_sliver(points, mine.values())]
+        for points in wide or outlines[face]:
             runs = find_runs(points, mine, gap)
             found.append((face, points, runs, mine))
             for run in runs:
@@ -123,16 +125,21 @@ def _find_loops(
     loops = []
     for face, points, runs, mine in found:
         others = {k: np.array(spans[sum(curve.pair) - face, k]).reshape(-1, 2) for k, curve in mine.items()}
-        meetings = find_meetings(points, runs, mine, others, fields, gap)
+        meetings = find_meetings(points, runs, mine, others, shapes, gap)
         loops.append(_Loop(face, points, runs, meetings, np.full((len(runs), 2), -1)))
     return loops
+
+
+def _is_sliver(loop: Array, curves: Iterable[Curve]) -> bool:
+    """Whether a loop lies along a single curve as a whole: of two data sets' outlines there, a remnant."""
+    return any(locate(curve, loop)[1].max() < curve.beside for curve in curves)
 
 
 def _unseen_curves(
     loops: Sequence[_Loop],
     curves: Sequence[Curve],
     outlines: Mapping[int, Sequence[Array]],
-    fields: Fields,
+    shapes: Shapes,
     gap: float,
 ) -> list[Curve]:
     """Curves of faces that meet in corners, but have none yet."""
@@ -142,11 +149,11 @@ def _unseen_curves(
         for pair in combinations(meeting.faces, 2):
             if pair not in known:
                 at.setdefault(pair, meeting.point)
-    found = (unseen_curve(pair, at[pair], outlines, fields, gap) for pair in sorted(at))
+    found = (unseen_curve(pair, at[pair], outlines, shapes, gap) for pair in sorted(at))
     return [curve for curve in found if curve is not None]
 
 
-def _find_corners(loops: Sequence[_Loop], fields: Fields) -> _Corners:
+def _find_corners(loops: Sequence[_Loop], shapes: Shapes) -> _Corners:
     """Corners of all meetings, those nearby being one; the runs' ends get their numbers."""
     meetings = [(loop, meeting) for loop in loops for meeting in loop.meetings]
     points = np.array([meeting.point for _, meeting in meetings]).reshape(-1, 3)
@@ -158,7 +165,7 @@ def _find_corners(loops: Sequence[_Loop], fields: Fields) -> _Corners:
         faces[corner] |= set(meeting.faces)
         loop.corners[meeting.run, 1] = loop.corners[meeting.following, 0] = corner
     placed = [
-        onto([fields[face] for face in sorted(some)], points[label == corner].mean(axis=0)[None])[0]
+        onto([shapes[face] for face in sorted(some)], points[label == corner].mean(axis=0)[None])[0]
         for corner, some in enumerate(faces)
     ]
     return _Corners(np.array(placed).reshape(-1, 3), faces)
@@ -177,7 +184,7 @@ def _end_near_corners(loops: Sequence[_Loop], curves: Sequence[Curve], corners: 
                         loop.corners[k, side] = numbers[nearest]
 
 
-def _find_knots(number: int, curve: Curve, loops: Sequence[_Loop], corners: _Corners, fields: Fields) -> _Knots:
+def _find_knots(number: int, curve: Curve, loops: Sequence[_Loop], corners: _Corners, shapes: Shapes) -> _Knots:
     """Of one curve: corners in which runs end, or that lie on it, and free ends, those nearby being one."""
     ends = [
         (t, int(loop.corners[k, side]))
@@ -197,7 +204,7 @@ def _find_knots(number: int, curve: Curve, loops: Sequence[_Loop], corners: _Cor
     return _Knots(
         np.concatenate([t, means])[order],
         np.concatenate([np.array(numbers, dtype=np.int64), np.full(len(means), -1)])[order],
-        np.concatenate([points, place(curve, means, fields) if len(means) else np.zeros((0, 3))])[order],
+        np.concatenate([points, place(curve, means, shapes) if len(means) else np.zeros((0, 3))])[order],
     )
 
 

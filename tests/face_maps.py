@@ -76,11 +76,12 @@ def bowed(surface, height):
     )
 
 
-def floor(name, start, end, *, far=3.0, sensor=1.5):
+def floor(name, start, end, *, far=3.0, sensor=1.5, pose=None):
     """Floor z = 0 over x from `start` to `end` and y from 0 to `far`."""
     x, y = np.meshgrid([start, end], [0.0, far], indexing="ij")
     data_set = name.split("/")[0]
-    part = PosePart(data_set, np.array([(start + end) / 2, sensor]), np.zeros((3, 3)))
+    covariance = np.zeros((3, 3)) if pose is None else pose
+    part = PosePart(data_set, np.array([(start + end) / 2, sensor]), covariance)
     return BSplineSurface(
         name,
         (data_set,),

@@ -47,6 +47,17 @@ def test_several_inputs_make_one_map_named_by_the_first(surfaces, tmp_path):
     assert not (tmp_path / "other.map.json").exists()
 
 
+def test_survey_folded_into_a_map_names_the_new_one(surfaces, tmp_path):
+    old, new = tmp_path / "old.map.json", tmp_path / "new.surfaces.json"
+    new.write_bytes(surfaces.read_bytes())
+    assert bsmap("merge", surfaces, "-o", old).code == 0
+    assert bsmap("merge", old, new).code == 0
+    before, after = read_surfaces(old), read_surfaces(tmp_path / "new.map.json")
+    assert [d.name for d in after.data_sets] == [d.name for d in before.data_sets]
+    assert len(after.surfaces) == len(before.surfaces)
+    assert {s.name for s in after.surfaces} >= {s.name for s in before.surfaces if len(s.data_sets) > 1}
+
+
 def test_what_it_refuses(surfaces, tmp_path):
     assert_usual_refusals("merge", surfaces, tmp_path)
     assert_refused(bsmap("merge", surfaces, tmp_path / "gone.json"), 66, "gone.json: no such file")

@@ -24,8 +24,9 @@ def merge(
     plots: tuple[Path, ...],
     force: bool,
 ) -> None:
-    """One map: overlaps divided and fused: X.map.json (named by the first input)."""
-    output = output or beside(surfaces_json[0], ".map.json", [".surfaces.json", ".map.json"])
+    """One map of surfaces of one survey or several, or of a map and new surveys: X.map.json (X of the first survey)."""
+    surveys = [path for path in surfaces_json if ".map.json" not in path.name]
+    output = output or beside([*surveys, *surfaces_json][0], ".map.json", [".surfaces.json", ".map.json"])
     check_plots(plots, [*surfaces_json, output])
     make_map_file(surfaces_json, output, merge_params, force)
     if plots:
@@ -56,8 +57,9 @@ def make_map_file(inputs: tuple[Path, ...], output: Path, merge_params: MergePar
 
 def _draw(inputs: tuple[Path, ...], output: Path, plots: tuple[Path, ...]) -> None:
     from bsmap_cli.io.surfaces_json import read_surfaces
+    from bsmap_cli.merge.inputs import unite
     from bsmap_cli.picture import draw_merge
 
-    before, merged = [read_surfaces(path) for path in inputs], read_surfaces(output)
+    before, merged = unite([read_surfaces(path) for path in inputs]).whole, read_surfaces(output)
     title = output.name.removesuffix(".map.json")
     draw_plots(plots, lambda path, ending: draw_merge(path, ending, before, merged, title))

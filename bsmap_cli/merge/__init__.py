@@ -9,6 +9,7 @@ from bsmap_cli.merge.inputs import separate_faces, unite
 from bsmap_cli.merge.joining import merge_pair
 from bsmap_cli.merge.pairs import Overlap, find_overlap
 from bsmap_cli.merge.patch import Patch, make_patch
+from bsmap_cli.merge.surveys import Summed, sum_up
 from bsmap_cli.model import Decision, SurfaceMap
 from bsmap_cli.params import MergeParams
 from bsmap_cli.track import Track, silent
@@ -52,9 +53,9 @@ def merge_surfaces(maps: Sequence[SurfaceMap], params: MergeParams, *, track: Tr
     SurfaceMap of all merged and all other patches, with a decision for every pair that meets. Trimmed surfaces (faces)
     are joined whole, see `merge.faces`.
     """
-    united, _ = unite(maps)
+    united, survey, survey_of_set, folds = unite(maps)
     surfaces, trimmed = separate_faces(united.surfaces)
-    faces = merge_faces(trimmed, united.creases, params, track=track) if trimmed else no_faces()
+    faces = merge_faces(trimmed, united.creases, survey, params, track=track) if trimmed else no_faces()
     taken = {surface.name for surface in united.surfaces}
     search = _Search(params, dict(enumerate(make_patch(surface) for surface in surfaces)))
     search.neighbours = {number: set() for number in search.patches}
@@ -72,10 +73,11 @@ def merge_surfaces(maps: Sequence[SurfaceMap], params: MergeParams, *, track: Tr
     notes = {"pairs_tested": search.tested, "mergings": mergings, "pairs_left_at_limit": len(search.waiting)}
     merged = tuple(patch.surface for patch in search.patches.values())
     decisions = (*united.decisions, *faces.decisions, *search.decisions)
-    surfaces_of_map = (*merged, *faces.surfaces)
-    return SurfaceMap(
-        surfaces_of_map, united.data_sets, decisions, notes | faces.notes, tuple(faces.creases), faces.corners
-    )
+    summed = Summed([*merged, *faces.surfaces], united.data_sets)
+    if folds:
+        summed = sum_up(*summed, survey_of_set)
+    creases, corners = tuple(faces.creases), faces.corners
+    return SurfaceMap(tuple(summed.surfaces), summed.data_sets, decisions, notes | faces.notes, creases, corners)
 
 
 def _test(search: _Search, pairs: Iterable[tuple[int, int]]) -> None:

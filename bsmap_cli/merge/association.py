@@ -1,7 +1,7 @@
 """Which faces of different data sets are one and the same: pairs that agree, joined strongest first."""
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -20,6 +20,12 @@ FAR_OFF = 4.0
 """Times the gate: faces of different data sets that are farther apart never come into one group by way of others."""
 
 
+SIGNIFICANT = 0.99999
+"""Share of the pairs that did not move for which an offset is not taken for a movement between two surveys."""
+COVERED = 0.5
+"""Share of the smaller of two faces that the other one covers, from which on they are taken for the same thing."""
+
+
 class Pair(NamedTuple):
     """Two faces, by number, that overlap or touch.
 
@@ -36,10 +42,16 @@ class Pair(NamedTuple):
     opposite: bool
 
 
-def associate(faces: Sequence[PlanarFace], params: MergeParams) -> tuple[list[list[int]], list[Decision]]:
+def associate(
+    faces: Sequence[PlanarFace], survey: Mapping[str, int], params: MergeParams
+) -> tuple[list[list[int]], list[Decision]]:
     """Groups of faces, each one physical face, and decisions: of each joining, and of two groups why they stay apart.
 
     Pairs of the same data set are never joined directly, and no two groups that hold such a pair at an offset.
+
+    Parameters
+    ----------
+    survey : number of the survey that each surface stems from, by name.
     """
     gate = float(chi2.ppf(params.gate, 1))
     pairs = [pair for a, b in _near(faces, params) if (pair := _compare(faces, a, b, params)) is not None]
@@ -67,8 +79,32 @@ def associate(faces: Sequence[PlanarFace], params: MergeParams) -> tuple[list[li
                 joined.append(_decision(faces, pair, None))
         if reason is not None and (not pair.same or pair.opposite):
             refused.append((pair, reason))
-    decisions = [*joined, *_refusals(faces, refused, group)]
+    decisions = [*joined, *_refusals(faces, _with_moved(faces, refused, group, survey), group)]
     return [sorted(found) for found in sorted(members.values(), key=min)], decisions
+
+
+def _with_moved(
+    faces: Sequence[PlanarFace],
+    refused: Sequence[tuple[Pair, str]],
+    group: Sequence[int],
+    survey: Mapping[str, int],
+) -> list[tuple[Pair, str]]:
+    """Refusals, those first and with a reason of their own where something moved: two faces that cover each other at a
+    significant offset, of which each survey saw but one.
+    """
+    least = float(chi2.ppf(SIGNIFICANT, 1))
+    surveys: dict[int, set[int]] = defaultdict(set)
+    for number, face in enumerate(faces):
+        surveys[group[number]].add(survey[face.surface.name])
+    moved, others = [], []
+    for pair, reason in refused:
+        covered = pair.area > COVERED * min(faces[pair.first].area, faces[pair.second].area)
+        apart = surveys[group[pair.first]].isdisjoint(surveys[group[pair.second]])
+        if covered and apart and not pair.opposite and pair.distance > least:
+            moved.append((pair, "it moved between two surveys"))
+        else:
+            others.append((pair, reason))
+    return [*moved, *others]
 
 
 def _refusals(faces: Sequence[PlanarFace], refused: Sequence[tuple[Pair, str]], group: Sequence[int]) -> list[Decision]:

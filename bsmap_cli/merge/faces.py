@@ -1,6 +1,6 @@
 """Trimmed faces of data sets -> faces of the map, every physical face once."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -31,7 +31,12 @@ def no_faces() -> MergedFaces:
 
 
 def merge_faces(
-    surfaces: Sequence[BSplineSurface], creases: Sequence[Crease], params: MergeParams, *, track: Track = silent
+    surfaces: Sequence[BSplineSurface],
+    creases: Sequence[Crease],
+    survey: Mapping[str, int],
+    params: MergeParams,
+    *,
+    track: Track = silent,
 ) -> MergedFaces:
     """Join faces over planes that are one, trim them by what any data set saw, and join their creases.
 
@@ -41,11 +46,12 @@ def merge_faces(
     Parameters
     ----------
     surfaces : trimmed surfaces of all data sets.  creases : to which their trims refer.
+    survey : number of the survey that each surface stems from, by name.
     """
     surfaces = sorted(surfaces, key=_key)
     faces = [face for s in surfaces if is_planar(s) and (face := planar_face(s)) is not None]
     track("merging faces", 0, 2)
-    groups = _groups(faces, associate(faces, params)[0], params)
+    groups = _groups(faces, associate(faces, survey, params)[0], params)
     corrections = adjust([(group.told, group.joined) for group in groups if group.joined])
     track("merging faces", 1, 2)
     if corrections:
@@ -54,7 +60,7 @@ def merge_faces(
         surfaces = [moved(surface, corrections) for surface in surfaces]
         faces = [face for s in surfaces if is_planar(s) and (face := planar_face(s)) is not None]
     gated = [face._replace(surface=with_left_over(face.surface, corrections)) for face in faces]
-    numbers, decisions = associate(gated, params)
+    numbers, decisions = associate(gated, survey, params)
     groups = _groups(faces, numbers, params)
     planar = {face.surface.name for face in faces}
     others = [surface for surface in surfaces if surface.name not in planar]

@@ -11,10 +11,16 @@ from bsmap_cli.model import Array, BSplineSurface, Crease, DataSet, Decision, He
 
 
 class United(NamedTuple):
-    """All maps in one.  survey : number of the map that each surface stems from, by name."""
+    """All maps in one.
+
+    surfaces, data_sets : by name the number of the map (the survey) that they stem from.
+    folds : whether the first is a map already, of joined faces, into which the others are folded.
+    """
 
     whole: SurfaceMap
-    survey: dict[str, int]
+    surfaces: dict[str, int]
+    data_sets: dict[str, int]
+    folds: bool
 
 
 def unite(maps: Sequence[SurfaceMap]) -> United:
@@ -30,16 +36,20 @@ def unite(maps: Sequence[SurfaceMap]) -> United:
     decisions: list[Decision] = []
     survey: dict[str, int] = {}
     corners: list[Array] = [np.zeros((0, 3))]
-    for number, given in enumerate(sorted(maps, key=_order)):
-        m = _named_apart(given, survey.keys(), {data_set.name for data_set in data_sets})
+    survey_of_set: dict[str, int] = {}
+    ordered = sorted(maps, key=_order)
+    for number, given in enumerate(ordered):
+        m = _named_apart(given, survey.keys(), survey_of_set.keys())
         surfaces += [_renumbered(surface, len(creases)) for surface in m.surfaces]
         creases += [_with_corners_from(crease, sum(map(len, corners))) for crease in m.creases]
         corners.append(m.corners)
         data_sets += sorted(m.data_sets, key=lambda data_set: data_set.name)
         decisions += [decision for decision in m.decisions if decision.first and not decision.second]
         survey |= {surface.name: number for surface in m.surfaces}
+        survey_of_set |= {data_set.name: number for data_set in m.data_sets}
     whole = SurfaceMap(tuple(surfaces), tuple(data_sets), tuple(decisions), {}, tuple(creases), np.concatenate(corners))
-    return United(whole, survey)
+    folds = len(maps) > 1 and any(len(surface.data_sets) > 1 for surface in ordered[0].surfaces)
+    return United(whole, survey, survey_of_set, folds)
 
 
 def _with_corners_from(crease: Crease, start: int) -> Crease:

@@ -1,7 +1,6 @@
 """Picture of a merge: the surfaces before and after, what was joined and refused, and how sure the map is."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,19 +32,19 @@ class Samples(NamedTuple):
     wall: NDArray[np.bool_]
 
 
-def draw_merge(path: Path, ending: str, before: Sequence[SurfaceMap], merged: SurfaceMap, title: str = "") -> None:
+def draw_merge(path: Path, ending: str, before: SurfaceMap, merged: SurfaceMap, title: str = "") -> None:
     """Write a picture to `path` in the format of `ending` (.png, .svg, .pdf).
 
-    before : the maps that were merged, in their order.  merged : what came out.
+    before : the maps that were merged, united as merging does.  merged : what came out.
     """
-    inputs = _named_as_in(merged, before)
+    inputs = before.surfaces
     drawn = [line for surface in (*inputs, *merged.surfaces) for line in outlines(surface)]
     limits = box(drawn)
     views = (PLAN, FRONT, SIDEWAYS)
     tall = [height + 0.95 for height in heights(limits, WIDTH / 2 - 1.0, views, 1.2, 10.0)]
     figure = new_figure(WIDTH, 2 * tall[0] + sum(tall[1:]) + 1.6)
     axes = figure.subplots(4, 2, height_ratios=[*tall, tall[0]])
-    names = [data_set.name for data_set in merged.data_sets]
+    names = [data_set.name for data_set in before.data_sets]
     by_set = dict(zip(names, colors(len(names)), strict=True))
     first = [by_set.get(surface.data_sets[0], "0.5") for surface in inputs]
     for row, view in enumerate(views):
@@ -61,19 +60,6 @@ def draw_merge(path: Path, ending: str, before: Sequence[SurfaceMap], merged: Su
     if title:
         figure.suptitle(title)
     save(figure, path, ending)
-
-
-def _named_as_in(merged: SurfaceMap, before: Sequence[SurfaceMap]) -> list[BSplineSurface]:
-    """Surfaces of all maps, with the names that the merge gave them and their data sets where maps share some."""
-    first = [data_set.name for m in before for data_set in m.data_sets]
-    prefixed = first != [data_set.name for data_set in merged.data_sets]
-    out = []
-    for number, m in enumerate(before, start=1):
-        mark = f"{number}." if prefixed else ""
-        for surface in m.surfaces:
-            sets = tuple(mark + name for name in surface.data_sets)
-            out.append(replace(surface, name=mark + surface.name, data_sets=sets))
-    return out
 
 
 def _draw_surfaces(

@@ -8,6 +8,7 @@ from scipy import sparse
 from scipy.linalg import eigh
 from scipy.sparse.linalg import SuperLU
 
+from bsmap_cli.core.modes import LEVER, MOST_MODES, largest_positive
 from bsmap_cli.model import Array, IntArray
 from bsmap_cli.slam.posegraph import factorise
 
@@ -15,11 +16,8 @@ MOST_POSES = 300
 """Poses solved for exactly; those between them are interpolated, for neighbours err alike."""
 COLUMNS = 120
 """Columns solved for at once."""
-MOST_MODES = 12
 LEAST_SHARE = 0.01
-"""Modes of the poses' errors that are told: at most so many, each with at least this share of the sum of variances."""
-LEVER = 3.0
-"""Metres at which an error of heading counts as one of position, for the choice of modes: where points are seen."""
+"""Of the sum of variances, that a mode must have to be told."""
 
 
 class Marginals(NamedTuple):
@@ -107,7 +105,5 @@ def _modes(joint: Array) -> Array:
     largest = [max(3 * k - MOST_MODES, 0), 3 * k - 1]
     values, vectors = eigh((joint + joint.T) / 2 * scale * scale[:, None], subset_by_index=largest)
     kept = np.flatnonzero(values > LEAST_SHARE * max(joint.diagonal() @ scale**2, 1e-300))[::-1]
-    vectors = vectors[:, kept] * np.sqrt(values[kept])
-    # An eigenvector's sign is free: its largest entry is made positive, so that it is the same everywhere.
-    vectors *= np.sign(vectors[np.argmax(np.abs(vectors), axis=0), np.arange(len(kept))])
+    vectors = largest_positive(vectors[:, kept] * np.sqrt(values[kept]))
     return (vectors / scale[:, None]).reshape(k, 3, len(kept))

@@ -37,23 +37,10 @@ def faces_of(place):
 
 
 STARTS = ((3.6, 2.9, 0.04), (4.4, 2.2, 1.6), (2.8, 1.9, 3.2))
-OPEN = {
-    ("floor cuts the corner of a pilaster", 2): "its front goes on beyond its edge under the ceiling, 59 mm",
-    ("floor of a niche reaches into the wall beside it", 1): "the wall goes on beyond the edge of the door, 42 mm",
-    ("floor reaches into the wall under a radiator", 2): "floor and wall under the radiator give a slanted face, 50 mm",
-}
-"""Not solved: cause and number of the start."""
+TURNS = [pytest.param(c, s, id=f"{c}, start {k}") for c in CAUSES for k, s in enumerate(STARTS)]
 
 
-def turns():
-    for cause in CAUSES:
-        for number, start in enumerate(STARTS):
-            why = OPEN.get((cause, number))
-            marks = [pytest.mark.xfail(reason=why, strict=True)] if why else []
-            yield pytest.param(cause, start, marks=marks, id=f"{cause}, start {number}")
-
-
-@pytest.mark.parametrize(("cause", "start"), list(turns()))
+@pytest.mark.parametrize(("cause", "start"), TURNS)
 def test_no_sample_of_a_turn_strays_from_the_truth(cause, start):
     place = turning_set(carve(CAUSES[cause]), start)
     samples = surface_samples(faces_of(place), 0.02)

@@ -28,12 +28,18 @@ class Crossings(NamedTuple):
 
     along, across : (m, n) number of the crossing on the edge to the next beam, to the next scan; -1 for none.
      points : (k, 3) in map.  faces : (k, 2) of the beam itself and of the next one.
+    passed : (k, 2) whether the scan that hits the other face passes through this one: it ends before the crossing.
     """
 
     along: IntArray
     across: IntArray
     points: Array
     faces: IntArray
+    passed: NDArray[np.bool_]
+
+    def reached(self, face: int, number: IntArray) -> NDArray[np.bool_]:
+        """Whether a face reaches crossings (j,)."""
+        return ~np.any((self.faces[number] == face) & self.passed[number], axis=1)
 
 
 def find_crossings(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField]) -> Crossings:
@@ -47,7 +53,8 @@ def find_crossings(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightFiel
         numbers.append(number)
         points.append(at)
         faces.append(pair)
-    return Crossings(numbers[0], numbers[1], np.concatenate(points), np.concatenate(faces))
+    pairs = np.concatenate(faces)
+    return Crossings(numbers[0], numbers[1], np.concatenate(points), pairs, np.zeros(pairs.shape, dtype=bool))
 
 
 def _on_edges(

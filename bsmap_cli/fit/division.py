@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bsmap_cli.fit.absorption import absorb
 from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.blocks import Blocks, make_blocks
 from bsmap_cli.fit.clutter import find_planes
@@ -62,6 +63,10 @@ def find_faces(grid: BeamGrid) -> Faces:
         labels, kept = _kept(labels, grid)
         if step < ROUNDS - 1:
             fitted = _fit_all(grid, labels, sigma)
+            after = absorb(grid, labels, [f.field for f in fitted], sigma)
+            if np.any(after != labels):
+                labels = _renumber(fill(grid, after), grid)
+                fitted = _fit_all(grid, labels, sigma)
         else:
             blocks = blocks_of_faces(grid, labels)
             fitted = [refit(fields[k], of_face, sigma) for k, of_face in zip(kept, blocks, strict=True)]

@@ -89,6 +89,28 @@ def within_ends(
     return crossings._replace(across=across, points=points)
 
 
+def passed_through(
+    grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], crossings: Crossings, ends: Ends
+) -> Crossings:
+    """Crossings between scans, marked where the scan that hits one face passes through the other.
+
+    A wall ends between two scans; the one beyond its end sees the floor go on behind the wall's place: there the wall
+    does not reach the crossing, which lies on a crease that ends before it.
+    """
+    row, column = np.nonzero(crossings.across >= 0)
+    number = crossings.across[row, column]
+    passed = crossings.passed.copy()
+    for side in (0, 1):
+        other = row + 1 - side
+        start, stop = ends.last[0, other, column], ends.last[1, other, column]
+        face = crossings.faces[number, side]
+        for k in np.unique(face):
+            of = np.flatnonzero((face == k) & (start >= 0))
+            first, last = (offset(fields[k], grid.points[other[of], end[of]])[0] for end in (start, stop))
+            passed[number[of], side] = (np.minimum(first, last) < -THROUGH) & (np.maximum(first, last) > THROUGH)
+    return crossings._replace(passed=passed)
+
+
 class _End:
     """One end of the runs of k beams: the face met there, or the plane across the scan line at the last beam."""
 

@@ -34,16 +34,16 @@ def outline(
     that every cell is run around counter-clockwise: a point is on the face if the loops wind around it.
 
     uv : (m, n, 2) parameters of the face's beams.  crossing_uv : (k, 2) of all crossings on this face.
-    believed : (m - 1, n - 1) cells that count.
+    believed : (4, m - 1, n - 1) corners of cells that count, in the order of CORNERS.
     """
     member = labels == face
-    corners = np.stack([member[:-1, :-1], member[:-1, 1:], member[1:, 1:], member[1:, :-1]])
-    full = np.all(corners, axis=0) & believed
-    mixed = np.any(corners, axis=0) & ~full & believed
+    corners = np.stack([member[:-1, :-1], member[:-1, 1:], member[1:, 1:], member[1:, :-1]]) & believed
+    full = np.all(corners, axis=0)
+    row, column = np.nonzero(np.any(corners, axis=0) & ~full)
     mirrored = np.zeros_like(full)
     cells = np.nonzero(full)
     mirrored[cells] = signed_area(np.stack([uv[cells[0] + i, cells[1] + k] for i, k in CORNERS], axis=1)) < 0.0
-    shares = _shares(face, labels, crossings, *np.nonzero(mixed))
+    shares = _shares(crossings, corners[:, row, column].T, row, column, face)
     at = np.concatenate([uv.reshape(-1, 2), crossing_uv])[shares.vertices]
     backwards = _areas(shares, at) < 0.0
     loops: list[list[int]] = []
@@ -72,17 +72,18 @@ class _Shares(NamedTuple):
         return np.repeat(np.arange(len(self.first)), np.diff(np.append(self.first, len(self.vertices))))
 
 
-def _shares(face: int, labels: IntArray, crossings: Crossings, row: IntArray, column: IntArray) -> _Shares:
-    """A face's shares of cells (k,): its corners, and the crossings on sides to other faces, where these are 3."""
-    m, n = labels.shape
-    own = np.stack([labels[row + i, column + k] == face for i, k in CORNERS], axis=1)
+def _shares(crossings: Crossings, own: NDArray[np.bool_], row: IntArray, column: IntArray, face: int) -> _Shares:
+    """A face's shares of cells (k,): own corners (k, 4) and the crossings on sides to others, where these are 3."""
+    m, n = crossings.along.shape
     border = own != np.roll(own, -1, axis=1)
     table = np.full((len(row), 8), -1)
     for side, ((i, k), kind) in enumerate(SIDES):
         corner = (row + CORNERS[side][0]) * n + column + CORNERS[side][1]
         table[:, 2 * side] = np.where(own[:, side], corner, -1)
         number = (crossings.along if kind == "along" else crossings.across)[row + i, column + k]
-        table[:, 2 * side + 1] = np.where(border[:, side] & (number >= 0), m * n + number, -1)
+        there = border[:, side] & (number >= 0)
+        there[there] = crossings.reached(face, number[there])
+        table[:, 2 * side + 1] = np.where(there, m * n + number, -1)
     table = table[np.count_nonzero(table >= 0, axis=1) >= 3]
     count = np.count_nonzero(table >= 0, axis=1)
     return _Shares(table[table >= 0], np.cumsum(count) - count)

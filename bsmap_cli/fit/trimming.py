@@ -7,10 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bsmap_cli.core.polygons import signed_area, simplify
+from bsmap_cli.fit.bare_ends import beyond_bare_ends
 from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.crossings import Crossings, find_crossings
 from bsmap_cli.fit.division import Faces
-from bsmap_cli.fit.ends import doubtful_cells, find_ends, on_faces, within_ends
+from bsmap_cli.fit.ends import doubtful_cells, find_ends, on_faces, passed_through, within_ends
 from bsmap_cli.fit.heights import Feet, HeightField
 from bsmap_cli.fit.labels import feet_of
 from bsmap_cli.fit.outline import outline
@@ -44,13 +45,15 @@ def trim(grid: BeamGrid, faces: Faces, feet: Sequence[Feet]) -> Trims:
     clean = on_faces(grid, faces.labels, feet)
     doubtful = doubtful_cells(clean, faces.labels, fields, crossings, ends)
     crossings = within_ends(clean, faces.labels, fields, crossings, ends)
+    crossings = passed_through(clean, faces.labels, fields, crossings, ends)
+    believed = ~(doubtful | beyond_bare_ends(clean, faces.labels, fields, ends))
     creases: dict[tuple[int, ...], int] = {}
     lines: list[CreaseLine] = []
     loops = []
     for number, field in enumerate(fields):
         uv = _node_parameters(grid, faces.labels, number, field, feet[number])
         at_crossings = field.parameters(field.base.local(crossings.points))
-        found = outline(number, faces.labels, crossings, uv, at_crossings, ~doubtful)
+        found = outline(number, faces.labels, crossings, uv, at_crossings, believed)
         sides = _Sides(field, uv.reshape(-1, 2), at_crossings, crossings, creases, lines)
         loops.append([loop for vertices in found.vertices if (loop := _loop(sides, vertices)) is not None])
     return Trims(loops, lines)
@@ -103,8 +106,8 @@ class _Sides(NamedTuple):
         return np.array([self.at_crossings[v - first] if v >= first else self.uv[v] for v in vertices])
 
     def pair(self, vertex: int) -> tuple[int, int] | None:
-        """The two faces of a crossing; None for a beam."""
-        if vertex < len(self.uv):
+        """The two faces of a crossing that both reach; None for a beam, or where one ends before."""
+        if vertex < len(self.uv) or self.crossings.passed[vertex - len(self.uv)].any():
             return None
         a, b = self.crossings.faces[vertex - len(self.uv)].tolist()
         return (a, b) if a < b else (b, a)

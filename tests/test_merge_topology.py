@@ -183,6 +183,24 @@ def test_edge_between_two_scans_is_found_where_both_walls_come_to_it(short, crea
     assert whole_mesh(result).is_watertight == (short < 0.1)
 
 
+def test_walls_that_hardly_bend_meet_between_their_corners():
+    """Two walls at six degrees, the second one seen from 3 cm on: no data set saw their edge."""
+    first = plate("a/1", (0, 0, 0), (2, 0, 0), (0, 0, 2.5), (2, 1.5), (0, -1, 1, -1))
+    second = narrowed(plate("a/2", (2, 0, 0), (2, 0.2, 0), (0, 0, 2.5), (2, 1.5), (2, -1, 3, -1)), 0.03, -1)
+    level = np.array([[0, 0], [0.5, 0], [1.0, 0.2 / 3], [1, 1], [0, 1]])
+    faces, creases = [first, second], []
+    for name, z, marks in (("a/3", 0.0, [0, 2, -1, -1, -1]), ("a/4", 2.5, [1, 3, -1, -1, -1])):
+        flat = plate(name, (0, 0, z), (4, 0, 0), (0, 3, 0), (2, 1.5))
+        faces.append(BSplineSurface(**{**vars(flat), "trims": (TrimLoop(level, np.array(marks)),)}))
+        creases.append(Crease(("a/1", name), np.array([[0, 0, z], [2, 0, z]])))
+        creases.append(Crease(("a/2", name), np.array([[2.03, 0.003, z], [4, 0.2, z]])))
+    result = merged(map_of(*faces, creases=[creases[k] for k in (0, 2, 1, 3)]))
+    assert (len(result.creases), len(result.corners)) == (5, 2)
+    assert any(set(crease.surfaces) == {"a/1", "a/2"} for crease in result.creases)
+    assert degrees(result).tolist() == [3, 3]
+    check_creases(result, 2e-3)  # nearly parallel faces do not tell where along them they meet
+
+
 def test_crease_that_ends_at_a_wall_gives_its_crease_a_corner():
     """A ramp begins in the middle of a wall: the wall's lower border goes straight on, in two creases."""
     flat = plate("a/1", (0, 0, 0), (2, 0, 0), (0, 3, 0), (2, 1.5), (0, 1, -1, -1))

@@ -144,12 +144,12 @@ def _unseen_curves(
 ) -> list[Curve]:
     """Curves of faces that meet in corners, but have none yet."""
     known = {curve.pair for curve in curves}
-    at: dict[FacePair, Array] = {}
+    at: dict[FacePair, list[Array]] = defaultdict(list)
     for meeting in (meeting for loop in loops for meeting in loop.meetings):
         for pair in combinations(meeting.faces, 2):
             if pair not in known:
-                at.setdefault(pair, meeting.point)
-    found = (unseen_curve(pair, at[pair], outlines, shapes, gap) for pair in sorted(at))
+                at[pair].append(meeting.point)
+    found = (unseen_curve(pair, np.array(at[pair]), outlines, shapes, gap) for pair in sorted(at))
     return [curve for curve in found if curve is not None]
 
 

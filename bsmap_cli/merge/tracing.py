@@ -74,18 +74,20 @@ def _through(pair: FacePair, along: Array, points: Array, shapes: Sequence[Shape
 
 
 def unseen_curve(
-    pair: FacePair, point: Array, outlines: Mapping[int, Sequence[Array]], shapes: Shapes, gap: float
+    pair: FacePair, corners: Array, outlines: Mapping[int, Sequence[Array]], shapes: Shapes, gap: float
 ) -> Curve | None:
-    """Curve through a corner (3,) in which two faces end side by side, though no data set saw their crease.
+    """Curve through corners (k, 3) in which two faces end side by side, though no data set saw their crease.
 
-    Scans that are parallel to an edge miss it: each face then ends at the last scan before it. None where not both
-    outlines come within half of `gap` of the same part of the line in which the faces cross.
+    Scans that are parallel to an edge miss it: each face then ends at the last scan before it. And where faces touch
+    without an angle nothing but two corners, with floor and ceiling, tells where one ends and the other begins. None
+    where not both outlines come within half of `gap` of the same part of the line.
     """
-    normals = [above(shapes[face], point[None])[1][0] for face in pair]
-    direction = np.cross(*normals)
+    direction = np.cross(*(above(shapes[face], corners[:1])[1][0] for face in pair))
     if np.linalg.norm(direction) < SKEW:
-        return None
-    ends = np.array([point, point + direction / np.linalg.norm(direction)])
+        direction = corners[np.argmax(np.linalg.norm(corners - corners[0], axis=1))] - corners[0]
+        if np.linalg.norm(direction) < gap:
+            return None
+    ends = np.array([corners[0], corners[0] + direction / np.linalg.norm(direction)])
     line = Curve(pair, ends, np.array([0.0, 1.0]), EVERYWHERE)
     both = [_beside(line, outlines[face], gap / 2.0) for face in pair]
     if not all(len(intervals) for intervals in both):

@@ -16,7 +16,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from bsmap_cli.merge.curves import Curve, FacePair, Shapes, between, locate, onto, place
-from bsmap_cli.merge.runs import OFF, Meeting, Run, find_meetings, find_runs, open_part
+from bsmap_cli.merge.rings import Knots, Loop, Ring, knots_of_run, put_together
+from bsmap_cli.merge.runs import OFF, find_meetings, find_runs
 from bsmap_cli.merge.tracing import curves_of, unseen_curve
 from bsmap_cli.model import Array, IntArray
 
@@ -32,29 +33,12 @@ class Edge(NamedTuple):
     corners: tuple[int, int]
 
 
-class Ring(NamedTuple):
-    """Loop of a face: points (k, 3) on it, and the number of the edge (k,) from each to the next one, or -1."""
-
-    points: Array
-    edges: IntArray
-
-
 class Topology(NamedTuple):
     """Rings of each face, edges between them, corners (k, 3)."""
 
     rings: dict[int, list[Ring]]
     edges: list[Edge]
     corners: Array
-
-
-class _Loop(NamedTuple):
-    """A loop of a face: its points (k, 3), its runs, where they meet, and the corners (r, 2) of their ends or -1."""
-
-    face: int
-    points: Array
-    runs: list[Run]
-    meetings: list[Meeting]
-    corners: IntArray
 
 
 class _Corners(NamedTuple):
@@ -68,18 +52,6 @@ class _Corners(NamedTuple):
         mine = np.array([k for k, faces in enumerate(self.faces) if set(curve.pair) <= faces], dtype=np.int64)
         t, off = locate(curve, self.points[mine])
         return mine[off < OFF], t[off < OFF]
-
-
-class _Knots(NamedTuple):
-    """Places at which a curve is divided: ascending lengths t (k,), corners (k,) or -1, points (k, 3)."""
-
-    t: Array
-    corners: IntArray
-    points: Array
-
-    def at(self, t: float, corner: int) -> int:
-        """The knot of the end of a run."""
-        return int(np.flatnonzero(self.corners == corner)[0] if corner >= 0 else np.argmin(np.abs(self.t - t)))
 
 
 def find_topology(
@@ -105,13 +77,13 @@ def find_topology(
     edges, kept = _shared_corners(edges)
     rings: dict[int, list[Ring]] = {face: [] for face in outlines}
     for loop in loops:
-        rings[loop.face].append(_ring(loop, curves, knots, edges, number_of))
+        rings[loop.face].append(put_together(loop, curves, knots, number_of))
     return Topology(rings, edges, corners.points[kept])
 
 
 def _find_loops(
     outlines: Mapping[int, Sequence[Array]], curves: Sequence[Curve], shapes: Shapes, gap: float
-) -> list[_Loop]:
+) -> list[Loop]:
     """All loops with their runs and where these meet."""
     found, spans = [], defaultdict(list)
     for face in sorted(outlines):
@@ -126,7 +98,7 @@ def _find_loops(
     for face, points, runs, mine in found:
         others = {k: np.array(spans[sum(curve.pair) - face, k]).reshape(-1, 2) for k, curve in mine.items()}
         meetings = find_meetings(points, runs, mine, others, shapes, gap)
-        loops.append(_Loop(face, points, runs, meetings, np.full((len(runs), 2), -1)))
+        loops.append(Loop(face, points, runs, meetings, np.full((len(runs), 2), -1)))
     return loops
 
 
@@ -136,7 +108,7 @@ def _is_sliver(loop: Array, curves: Iterable[Curve]) -> bool:
 
 
 def _unseen_curves(
-    loops: Sequence[_Loop],
+    loops: Sequence[Loop],
     curves: Sequence[Curve],
     outlines: Mapping[int, Sequence[Array]],
     shapes: Shapes,
@@ -153,7 +125,7 @@ def _unseen_curves(
     return [curve for curve in found if curve is not None]
 
 
-def _find_corners(loops: Sequence[_Loop], shapes: Shapes) -> _Corners:
+def _find_corners(loops: Sequence[Loop], shapes: Shapes) -> _Corners:
     """Corners of all meetings, those nearby being one; the runs' ends get their numbers."""
     meetings = [(loop, meeting) for loop in loops for meeting in loop.meetings]
     points = np.array([meeting.point for _, meeting in meetings]).reshape(-1, 3)
@@ -171,7 +143,7 @@ def _find_corners(loops: Sequence[_Loop], shapes: Shapes) -> _Corners:
     return _Corners(np.array(placed).reshape(-1, 3), faces)
 
 
-def _end_near_corners(loops: Sequence[_Loop], curves: Sequence[Curve], corners: _Corners, gap: float) -> None:
+def _end_near_corners(loops: Sequence[Loop], curves: Sequence[Curve], corners: _Corners, gap: float) -> None:
     """Ends of runs that miss a corner of their curve by little get its number."""
     on = [corners.on(curve) for curve in curves]
     for loop in loops:
@@ -184,7 +156,7 @@ def _end_near_corners(loops: Sequence[_Loop], curves: Sequence[Curve], corners: 
                         loop.corners[k, side] = numbers[nearest]
 
 
-def _find_knots(number: int, curve: Curve, loops: Sequence[_Loop], corners: _Corners, shapes: Shapes) -> _Knots:
+def _find_knots(number: int, curve: Curve, loops: Sequence[Loop], corners: _Corners, shapes: Shapes) -> Knots:
     """Of one curve: corners in which runs end, or that lie on it, and free ends, those nearby being one."""
     ends = [
         (t, int(loop.corners[k, side]))
@@ -201,28 +173,21 @@ def _find_knots(number: int, curve: Curve, loops: Sequence[_Loop], corners: _Cor
     parts = np.split(free, np.flatnonzero(np.diff(free) > SAME) + 1) if len(free) else []
     means = np.array([part.mean() for part in parts])
     order = np.argsort(np.concatenate([t, means]), kind="stable")
-    return _Knots(
+    return Knots(
         np.concatenate([t, means])[order],
         np.concatenate([np.array(numbers, dtype=np.int64), np.full(len(means), -1)])[order],
         np.concatenate([points, place(curve, means, shapes) if len(means) else np.zeros((0, 3))])[order],
     )
 
 
-def _between_knots(loop: _Loop, k: int, knots: _Knots) -> tuple[int, int]:
-    """The knots at which the k-th run of a loop starts and ends; the same twice where nothing of it is left."""
-    run = loop.runs[k]
-    start, end = (knots.at(t, int(c)) for t, c in zip((run.start, run.end), loop.corners[k], strict=True))
-    return (start, end) if (end - start) * run.sign > 0 else (start, start)
-
-
 def _find_edges(
-    curves: Sequence[Curve], knots: Sequence[_Knots], loops: Sequence[_Loop]
+    curves: Sequence[Curve], knots: Sequence[Knots], loops: Sequence[Loop]
 ) -> tuple[list[Edge], dict[tuple[int, int], int]]:
     """What both faces of a curve run along, from knot to knot; and its number by curve and first knot."""
     had: list[list[set[int]]] = [[set() for _ in own.t] for own in knots]
     for loop in loops:
         for k, run in enumerate(loop.runs):
-            start, end = _between_knots(loop, k, knots[run.curve])
+            start, end = knots_of_run(loop, k, knots[run.curve])
             for knot in range(min(start, end), max(start, end)):
                 had[run.curve][knot].add(loop.face)
     edges: list[Edge] = []
@@ -247,45 +212,3 @@ def _shared_corners(edges: Sequence[Edge]) -> tuple[list[Edge], IntArray]:
         edge._replace(corners=(new.get(a, -1), new.get(b, -1)))
         for edge, (a, b) in zip(edges, ends.tolist(), strict=True)
     ], kept
-
-
-def _ring(
-    loop: _Loop,
-    curves: Sequence[Curve],
-    knots: Sequence[_Knots],
-    edges: Sequence[Edge],
-    number_of: Mapping[tuple[int, int], int],
-) -> Ring:
-    """The loop put together from edges and from what is open."""
-    if not loop.runs:
-        return Ring(loop.points, np.full(len(loop.points), -1))
-    met = {meeting.run for meeting in loop.meetings}
-    points, numbers = [], []
-    for k, run in enumerate(loop.runs):
-        own = knots[run.curve]
-        start, end = _between_knots(loop, k, own)
-        for knot in range(start, end, run.sign):
-            low, high = sorted((knot, knot + run.sign))
-            edge = number_of.get((run.curve, low), -1)
-            inner = between(curves[run.curve], own.t[low], own.t[high])
-            line = np.concatenate([own.points[low : low + 1], inner, own.points[high : high + 1]])
-            points.append(line[:: run.sign][:-1])
-            numbers += [edge] * (len(line) - 1)
-        if k not in met:
-            following = loop.runs[(k + 1) % len(loop.runs)]
-            way = open_part(loop.points, run.last, following.first)[1:-1]
-            way = _off_run(way, curves[run.curve], own.t[end], run.sign)
-            start = _between_knots(loop, (k + 1) % len(loop.runs), knots[following.curve])[0]
-            back = _off_run(way[::-1], curves[following.curve], knots[following.curve].t[start], -following.sign)
-            points.append(np.concatenate([own.points[end : end + 1], back[::-1]]))
-            numbers += [-1] * (len(back) + 1)
-    return Ring(np.concatenate(points).reshape(-1, 3), np.array(numbers))
-
-
-def _off_run(way: Array, curve: Curve, end: float, sign: int) -> Array:
-    """The way (k, 3) on from the end of a run, without what of its beginning doubles back along the run."""
-    if not len(way):
-        return way
-    t, off = locate(curve, way)
-    on = (off < curve.beside) & ((t - end) * sign <= 0.0)
-    return way[len(way) if on.all() else int(np.argmin(on)) :]

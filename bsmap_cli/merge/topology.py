@@ -15,7 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from bsmap_cli.merge.curves import Curve, FacePair, Shapes, between, locate, onto, place
+from bsmap_cli.merge.curves import Curve, FacePair, Shapes, between, locate, onto, place, touched
 from bsmap_cli.merge.rings import Knots, Loop, Ring, knots_of_run, put_together
 from bsmap_cli.merge.runs import OFF, find_meetings, find_runs
 from bsmap_cli.merge.tracing import curves_of, unseen_curve
@@ -70,7 +70,7 @@ def find_topology(
     if unseen := _unseen_curves(loops, curves, outlines, shapes, gap):
         curves += unseen
         loops = _find_loops(outlines, curves, shapes, gap)
-    corners = _find_corners(loops, shapes)
+    corners = _find_corners(loops, shapes, gap)
     _end_near_corners(loops, curves, corners, gap)
     knots = [_find_knots(number, curve, loops, corners, shapes) for number, curve in enumerate(curves)]
     edges, number_of = _find_edges(curves, knots, loops)
@@ -97,6 +97,7 @@ def _find_loops(
     loops = []
     for face, points, runs, mine in found:
         others = {k: np.array(spans[sum(curve.pair) - face, k]).reshape(-1, 2) for k, curve in mine.items()}
+        runs = [r for r in runs if touched(others[r.curve], min(r.start, r.end), max(r.start, r.end), gap)]
         meetings = find_meetings(points, runs, mine, others, shapes, gap)
         loops.append(Loop(face, points, runs, meetings, np.full((len(runs), 2), -1)))
     return loops
@@ -125,11 +126,14 @@ def _unseen_curves(
     return [curve for curve in found if curve is not None]
 
 
-def _find_corners(loops: Sequence[Loop], shapes: Shapes) -> _Corners:
+def _find_corners(loops: Sequence[Loop], shapes: Shapes, gap: float) -> _Corners:
     """Corners of all meetings, those nearby being one; the runs' ends get their numbers."""
     meetings = [(loop, meeting) for loop in loops for meeting in loop.meetings]
     points = np.array([meeting.point for _, meeting in meetings]).reshape(-1, 3)
-    near = cKDTree(points).query_pairs(SAME, output_type="ndarray") if len(points) else np.zeros((0, 2), dtype=int)
+    near = cKDTree(points).query_pairs(gap, output_type="ndarray") if len(points) else np.zeros((0, 2), dtype=int)
+    # The same three faces meet once; where they touch without an angle, each loop tells another place.
+    alike = np.array([meetings[a][1].faces == meetings[b][1].faces for a, b in near.tolist()], dtype=bool)
+    near = near[alike | (np.linalg.norm(points[near[:, 0]] - points[near[:, 1]], axis=1) < SAME)]
     n = len(points)
     label = connected_components(coo_array((np.ones(len(near)), near.T), shape=(n, n)), directed=False)[1]
     faces: list[set[int]] = [set() for _ in range(label.max(initial=-1) + 1)]

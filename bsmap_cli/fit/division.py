@@ -12,7 +12,7 @@ from bsmap_cli.fit.blocks import Blocks, make_blocks
 from bsmap_cli.fit.clutter import find_planes
 from bsmap_cli.fit.crossings import find_crossings
 from bsmap_cli.fit.heights import Base, CylinderBase, HeightField, plane_base
-from bsmap_cli.fit.labels import adopt, drop_outliers, fill, move_breaks, runs_of
+from bsmap_cli.fit.labels import adopt, drop_alike, drop_outliers, fill, move_breaks, runs_of
 from bsmap_cli.fit.lowmodels import fit_cylinder_frame, fit_plane_frame
 from bsmap_cli.fit.pieces import find_pieces
 from bsmap_cli.fit.regions import find_regions
@@ -58,6 +58,7 @@ def find_faces(grid: BeamGrid) -> Faces:
         labels = drop_outliers(grid, labels, fields, sigma)
         labels = adopt(grid, labels, fields, sigma)
         labels = move_breaks(grid, labels, fields, sigma)
+        labels = drop_alike(grid, labels, fields, sigma)
         if step < ROUNDS - 1:
             labels = find_planes(grid, labels, sigma, rng)
         labels, kept = _kept(labels, grid)
@@ -68,8 +69,7 @@ def find_faces(grid: BeamGrid) -> Faces:
                 labels = _renumber(fill(grid, after), grid)
                 fitted = _fit_all(grid, labels, sigma)
         else:
-            blocks = blocks_of_faces(grid, labels)
-            fitted = [refit(fields[k], of_face, sigma) for k, of_face in zip(kept, blocks, strict=True)]
+            fitted = _refit_all(grid, labels, [fields[k] for k in kept], sigma)
     labels, kept = _believed(grid, labels, [f.field for f in fitted], sigma)
     fitted = [fitted[k] for k in kept]
     return Faces(labels, _widened(grid, labels, fitted, sigma), sigma)
@@ -128,12 +128,21 @@ def blocks_of_faces(grid: BeamGrid, labels: IntArray) -> list[Blocks]:
 
 
 def _fit_all(grid: BeamGrid, labels: IntArray, sigma: float) -> list[Fitted]:
-    fitted = []
-    for number, blocks in enumerate(blocks_of_faces(grid, labels)):
-        base = choose_base(blocks, sigma)
-        low, high = _rectangle(grid, labels == number, base)
-        fitted.append(fit_heights(blocks, base, low, high, sigma))
-    return fitted
+    return [_fit(grid, labels == k, blocks, sigma) for k, blocks in enumerate(blocks_of_faces(grid, labels))]
+
+
+def _fit(grid: BeamGrid, member: NDArray[np.bool_], blocks: Blocks, sigma: float) -> Fitted:
+    base = choose_base(blocks, sigma)
+    return fit_heights(blocks, base, *_rectangle(grid, member, base), sigma)
+
+
+def _refit_all(grid: BeamGrid, labels: IntArray, fields: list[HeightField], sigma: float) -> list[Fitted]:
+    """Faces fitted anew on their knots; where the beams now ask for the other kind of base, from the beginning."""
+    out = []
+    for number, (field, blocks) in enumerate(zip(fields, blocks_of_faces(grid, labels), strict=True)):
+        same = type(choose_base(blocks, sigma)) is type(field.base)
+        out.append(refit(field, blocks, sigma) if same else _fit(grid, labels == number, blocks, sigma))
+    return out
 
 
 def choose_base(blocks: Blocks, sigma: float) -> Base:

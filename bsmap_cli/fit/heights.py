@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bsmap_cli.core.bspline import TensorSpline, clamped_knots, design_matrix, inner_knots
+from bsmap_cli.core.bspline import TensorSpline, clamped_knots, design_matrix, inner_knots, open_knots
 from bsmap_cli.core.pieces import Pieces, evaluate_pieces, polynomial_pieces
 from bsmap_cli.fit.lowmodels import axes_of
 from bsmap_cli.model import Array
@@ -111,7 +111,17 @@ class Knots(NamedTuple):
 
 def flat_knots() -> Knots:
     """The least surface: bilinear, without inner knots."""
-    return Knots(1, 1, np.array([0.0, 0.0, 1.0, 1.0]), np.array([0.0, 0.0, 1.0, 1.0]))
+    return Knots(1, 1, open_knots(1), open_knots(1))
+
+
+def least_knots(base: Base) -> Knots:
+    """Knots of the least surface that can bear what the base took from the data.
+
+    A plane's offset and slopes are those of a bilinear surface. A cylinder's radius and centre are heights that go like
+    1, sine and cosine around it: without a second degree the covariance would know nothing of the last.
+    """
+    flat = flat_knots()
+    return flat if isinstance(base, PlaneBase) else flat._replace(degree_s=2, s=open_knots(2))
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.heights import STEEPEST, Feet, HeightField, find_feet
@@ -12,6 +13,8 @@ from bsmap_cli.model import Array, IntArray
 
 OUTLIER, ADOPTED = 4.5, 3.5
 """Standard deviations beyond which a beam leaves its face, within which one of the rest joins a neighbouring face."""
+ALIKE = ((3, 3), (7, 1))
+"""Scans and beams of neighbourhoods whose misses are added up."""
 PASSES = 30
 REACH = 12
 """Beams by which a border may move at once."""
@@ -56,6 +59,23 @@ def drop_outliers(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField
         mask = (labels == number) & grid.hit
         feet = feet_of(grid, field, mask)
         labels[mask] = np.where(np.abs(feet.beyond) < OUTLIER * sigma, number, -1)
+    return labels
+
+
+def drop_alike(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], sigma: float) -> IntArray:
+    """Labels without the beams that miss their face by less than an outlier, but together with their neighbours.
+
+    The side of a recess that is no deeper than the gate of outliers would otherwise be shared out to the faces above
+    and below it.
+    """
+    labels = labels.copy()
+    for number, field in enumerate(fields):
+        mask = (labels == number) & grid.hit
+        miss, count = np.zeros(labels.shape), mask.astype(float)
+        miss[mask] = np.clip(feet_of(grid, field, mask).beyond / sigma, -OUTLIER, OUTLIER)
+        for window in ALIKE:
+            total, number_of = (ndimage.convolve(of, np.ones(window), mode="constant") for of in (miss, count))
+            labels[mask & (np.abs(total) > OUTLIER * np.sqrt(number_of)) & (miss * total > 0.0)] = -1
     return labels
 
 

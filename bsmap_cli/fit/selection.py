@@ -16,7 +16,7 @@ from bsmap_cli.fit.heights import (
     Knots,
     evaluate,
     find_feet,
-    flat_knots,
+    least_knots,
     with_degree,
     with_knot,
 )
@@ -72,7 +72,8 @@ class _Trial(NamedTuple):
 
 def fit_heights(blocks: Blocks, base: Base, low: Array, high: Array, sigma: float) -> Fitted:
     """Fit with the degrees and knots of the best criterion, found step by step from the least surface."""
-    field = HeightField(base, low, high, flat_knots(), np.zeros((2, 2)))
+    knots = least_knots(base)
+    field = HeightField(base, low, high, knots, np.zeros(knots.shape))
     best = _solve(field, field.knots, _linearise(field, blocks, sigma)).fitted
     data = _linearise(best.field, blocks, sigma)
     trial = _solve(best.field, field.knots, data)

@@ -1,0 +1,115 @@
+"""Two faces compared where they overlap or touch: how far apart they lie, and how far their covariances allow."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import shapely
+
+from bsmap_cli.fit.heights import evaluate
+from bsmap_cli.merge.planar import PlanarFace, height_variances, pose_variances
+from bsmap_cli.merge.regions import Region
+from bsmap_cli.model import Array
+from bsmap_cli.params import MergeParams
+
+LARGEST_ANGLE = np.radians(25.0)
+"""Between the base planes of faces that are compared at all; whether they agree is told by their heights."""
+
+
+class Pair(NamedTuple):
+    """Two faces, by number, that overlap or touch.
+
+    area : square metres that both have.  offset : metres, root mean square between them there, or at the border.
+    distance : squared Mahalanobis distance of one degree of freedom, mean.  same : whether a data set has both.
+    """
+
+    first: int
+    second: int
+    area: float
+    offset: float
+    distance: float
+    same: bool
+    opposite: bool
+
+
+class Comparison(NamedTuple):
+    """Faces to be compared.  reach : of each the region and what lies beside it within the gap."""
+
+    faces: Sequence[PlanarFace]
+    reach: Sequence[Region]
+    params: MergeParams
+
+
+def prepared(faces: Sequence[PlanarFace], params: MergeParams) -> Comparison:
+    """Faces ready to be compared many times."""
+    regions = [face.region for face in faces]
+    reach = list(shapely.buffer(regions, params.gap, quad_segs=2)) if regions else []
+    shapely.prepare(regions)
+    shapely.prepare(reach)
+    return Comparison(faces, reach, params)
+
+
+def near(faces: Sequence[PlanarFace], params: MergeParams) -> list[list[tuple[int, float]]]:
+    """Of each face those whose boxes are near and whose planes are about parallel: numbers, and about square metres
+    that the boxes share.
+    """
+    out: list[list[tuple[int, float]]] = [[] for _ in faces]
+    if len(faces) < 2:
+        return out
+    low = np.array([face.samples.min(axis=0) for face in faces])
+    high = np.array([face.samples.max(axis=0) for face in faces])
+    normals = np.array([face.normal for face in faces])
+    reach = max(params.distance, params.gap)
+    boxes = shapely.box(low[:, 0], low[:, 1], high[:, 0], high[:, 1])
+    wide = shapely.box(low[:, 0] - reach, low[:, 1] - reach, high[:, 0] + reach, high[:, 1] + reach)
+    a, b = shapely.STRtree(boxes).query(wide)
+    level = (low[a, 2] - reach <= high[b, 2]) & (low[b, 2] - reach <= high[a, 2])
+    parallel = np.abs(np.sum(normals[a] * normals[b], axis=1)) > np.cos(LARGEST_ANGLE)
+    kept = (a != b) & level & parallel
+    a, b = a[kept], b[kept]
+    shared = np.maximum(np.minimum(high[a], high[b]) - np.maximum(low[a], low[b]), 0.0)
+    overlap = np.prod(np.sort(shared, axis=1)[:, 1:], axis=1)
+    for one, other, area in zip(a.tolist(), b.tolist(), overlap.tolist(), strict=True):
+        out[one].append((other, area))
+    return out
+
+
+class _Offsets(NamedTuple):
+    """Of one face's samples that lie on another face or beside it: heights, variances, areas, whether on it."""
+
+    heights: Array
+    variances: Array
+    areas: Array
+    inside: Array
+
+
+def compare(comparison: Comparison, a: int, b: int) -> Pair | None:
+    """Both compared where they overlap, else where they touch; None where they do neither within reach."""
+    one, other = comparison.faces[a], comparison.faces[b]
+    both = [_offsets(comparison, a, b), _offsets(comparison, b, a)]
+    h, variance, areas, inside = (np.concatenate(parts) for parts in zip(*both, strict=True))
+    # Where they overlap, what lies beside says no more.
+    used = inside > 0.0 if np.any((inside > 0.0) & (areas > 0.0)) else np.ones(len(h), dtype=bool)
+    if not len(h) or np.abs(h[used]).min() > 2.0 * comparison.params.distance:
+        return None
+    offset = float(np.sqrt(np.mean(h[used] ** 2)))
+    distance = float(np.mean(h[used] ** 2 / variance[used]))
+    same = bool(set(one.surface.data_sets) & set(other.surface.data_sets))
+    looks = one.facing * other.facing * np.sign(one.normal @ other.normal)
+    area = float(areas[inside > 0.0].sum() / 2.0)
+    return Pair(a, b, area, offset, distance, same, bool(looks < 0.0))
+
+
+def _offsets(comparison: Comparison, of: int, to: int) -> _Offsets:
+    face, on, params = comparison.faces[of], comparison.faces[to], comparison.params
+    local = on.field.base.local(face.samples)
+    within = shapely.contains_xy(comparison.reach[to], local[:, :2])
+    if not within.any():
+        return _Offsets(*np.zeros((4, 0)))
+    points, local = face.samples[within], local[within]
+    uv = on.field.parameters(local)
+    h = local[:, 2] - evaluate(on.field, uv)[0]
+    variance = face.variances[within] + height_variances(on.surface, on.field, uv) + 2.0 * params.flatness**2
+    variance += pose_variances(on, face, points)
+    inside = shapely.contains_xy(on.region, local[:, :2]).astype(float)
+    return _Offsets(h, variance, face.areas[within], inside)

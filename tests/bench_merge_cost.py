@@ -38,8 +38,9 @@ def main(most=200):
     fitted = fit_surfaces(make_cloud(true_slam_map(simulated("room")), CloudParams()), FitParams(method="faces"))
     sets, rng = len(fitted.data_sets), np.random.default_rng(0)
     print(f"{'sets':>5} {'faces':>6} {'of map':>6} {'decisions':>9} {'s':>7} {'s a set':>8}")
-    count = 1
-    while sets * count <= int(most):
+    for count in (1, 2, 4, 8, 16, 28):
+        if sets * count > int(most):
+            break
         surveys = [replace(fitted, surfaces=tuple(drawn(s, rng) for s in fitted.surfaces)) for _ in range(count)]
         start = time.process_time()
         merged = merge_surfaces(surveys, MergeParams())
@@ -47,7 +48,6 @@ def main(most=200):
         faces = count * len(fitted.surfaces)
         row = f"{sets * count:5d} {faces:6d} {len(merged.surfaces):6d} {len(merged.decisions):9d}"
         print(f"{row} {seconds:7.1f} {seconds / (sets * count):8.3f}", flush=True)
-        count *= 2
 
 
 if __name__ == "__main__":

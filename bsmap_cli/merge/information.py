@@ -242,11 +242,13 @@ def _middles(knots: Array) -> list[float]:
 
 def solve(told: Sequence[Told], frame: Frame, knots: Knots) -> Joined:
     """Heights on given knots; data sets that disagree count less (two rounds)."""
-    P = [one.carry @ basis_matrix(knots, one.uv) for one in told]
+    at = np.split(basis_matrix(knots, np.concatenate([one.uv for one in told])), _ends(told))
+    P = [one.carry @ basis for one, basis in zip(told, at, strict=True)]
     wanted = [one.sensor_root @ one.heights for one in told]
     N = [one.sensor_root @ p for one, p in zip(told, P, strict=True)]
     share = np.ones(len(told))
-    strays = [_stray(one, knots) for one in told]
+    # What the faces told cannot follow of the joined heights, weighted: their heights do not show it.
+    strays = [one.stiffness * (basis - one.basis @ p) for one, basis, p in zip(told, at, P, strict=True)]
     stiff = smoothness(knots) + np.sum([stray.T @ stray for stray in strays], axis=0)
     for _ in range(3):
         H = stiff + sum(w * n.T @ n for w, n in zip(share, N, strict=True))
@@ -263,10 +265,9 @@ def solve(told: Sequence[Told], frame: Frame, knots: Knots) -> Joined:
     return Joined(field, H, gains, float(loss.sum() + beyond) + PRICE * knots.size)
 
 
-def _stray(one: Told, knots: Knots) -> Array:
-    """(m, n) from joined heights to what the face told cannot follow of them, weighted: its heights do not show it."""
-    at = basis_matrix(knots, one.uv)
-    return np.asarray(one.stiffness * (at - one.basis @ (one.carry @ at)))
+def _ends(told: Sequence[Told]) -> list[int]:
+    """Where the samples of each face but the last end, all of them in a row."""
+    return np.cumsum([len(one.uv) for one in told])[:-1].tolist()
 
 
 def covariance_of(joined: Joined, told: Sequence[Told]) -> HeightCovariance:

@@ -64,7 +64,8 @@ def _odometry_edges(log: ScanLog, tracking: Tracking, chain: Edges, params: Slam
         information = np.broadcast_to(np.diag(1.0 / NO_ODOMETRY**2), (len(chain.first), 3, 3))
         return chain._replace(information=information.copy())
     before, after = (log.odometry[tracking.keys[end]] for end in (chain.first, chain.second))
-    motions = [odometry_motion(a, b, params) for a, b in zip(before, after, strict=True)]
+    scale = tracking.odometry_scale
+    motions = [odometry_motion(a, b, params, scale) for a, b in zip(before, after, strict=True)]
     relative = np.array([motion.increment for motion in motions]).reshape(-1, 3)
     noise = np.array([motion.noise for motion in motions]).reshape(-1, 3, 3) + np.diag(ODOMETRY_FLOOR) ** 2
     # Single readings may be far off: then the edge gives way.

@@ -20,7 +20,7 @@ from bsmap_cli.slam.matching import (
     oriented_points,
     search,
 )
-from bsmap_cli.slam.motion import Motion, beam_motion, constant_velocity, odometry_motion
+from bsmap_cli.slam.motion import Motion, OdometryScale, beam_motion, constant_velocity, odometry_motion
 from bsmap_cli.slam.posegraph import Edges
 from bsmap_cli.slam.segments import scan_batches
 from bsmap_cli.track import Track
@@ -43,6 +43,7 @@ class Tracking(NamedTuple):
     points : of each key scan, in base_link.  edges : from each key scan but the first to an earlier one.
     match_information : (k - 1, 3, 3), what the match alone says of each edge.
     weak : (k,) key scans whose match failed, so that their edge holds no more than the motion prior.
+    odometry_scale : metres of way for a metre of odometry.
     """
 
     poses: Array
@@ -51,6 +52,7 @@ class Tracking(NamedTuple):
     edges: Edges
     match_information: Array
     weak: NDArray[np.bool_]
+    odometry_scale: float
 
 
 def track_scans(log: ScanLog, range_sigma: float, params: SlamParams, track: Track) -> Tracking:
@@ -58,7 +60,7 @@ def track_scans(log: ScanLog, range_sigma: float, params: SlamParams, track: Tra
     n = len(log.horizontal.time_ns)
     poses = np.zeros((n, 3))
     keys, key_points, information, by_match, inliers = [0], [], [], [], [1.0]
-    last, before = 0, 0
+    last, before, scale = 0, 0, OdometryScale()
     noise = match_noise(range_sigma)
     scans = _points_of_scans(log, range_sigma)
     key_points.append(next(scans))
@@ -66,7 +68,7 @@ def track_scans(log: ScanLog, range_sigma: float, params: SlamParams, track: Tra
     target = make_target(placed[0])
     for k, points in enumerate(scans, 1):
         track("slam: tracking", k + 1, n)
-        prior = _motion(log, poses, before, last, k, params)
+        prior = _motion(log, poses, before, last, k, params, scale.value)
         predicted = se2.compose(poses[last], prior.increment)
         poses[k] = predicted
         if log.odometry is not None and not _moved(prior.increment, params.match_distance, params.match_angle):
@@ -80,13 +82,15 @@ def track_scans(log: ScanLog, range_sigma: float, params: SlamParams, track: Tra
         inliers.append(found.inliers)
         by_match.append(_in_frame_of(predicted, found.information))
         information.append(_edge_information(by_match[-1], found, prior))
+        if log.odometry is not None and min(inliers[-2:]) >= GOOD:
+            scale = scale.seen(se2.between(log.odometry[keys[-1]], log.odometry[k]), step, by_match[-1])
         keys.append(k)
         key_points.append(points)
         placed = [*placed[-WINDOW:], points.moved(poses[k])]
         target = make_target(joined([placed[j - len(keys)] for j in _local(inliers)]))
     chain = _chain(poses[keys], information, np.array(inliers))
     match_information = np.array(by_match).reshape(-1, 3, 3)
-    return Tracking(poses, np.array(keys), key_points, chain, match_information, np.array(inliers) < WEAK)
+    return Tracking(poses, np.array(keys), key_points, chain, match_information, np.array(inliers) < WEAK, scale.value)
 
 
 def _local(inliers: list[float]) -> list[int]:
@@ -109,10 +113,10 @@ def _moved(increment: Array, distance: float, angle: float) -> bool:
     return bool(np.hypot(increment[0], increment[1]) >= distance or abs(increment[2]) >= angle)
 
 
-def _motion(log: ScanLog, poses: Array, before: int, last: int, k: int, params: SlamParams) -> Motion:
+def _motion(log: ScanLog, poses: Array, before: int, last: int, k: int, params: SlamParams, scale: float) -> Motion:
     """Prior of the motion from scan `last` to scan k."""
     if log.odometry is not None:
-        return odometry_motion(log.odometry[last], log.odometry[k], params)
+        return odometry_motion(log.odometry[last], log.odometry[k], params, scale)
     time = log.horizontal.time_ns
     seconds, earlier = (max(float(d) * 1e-9, 0.0) for d in (time[k] - time[last], time[last] - time[before]))
     return constant_velocity(se2.between(poses[before], poses[last]), earlier, seconds, params)

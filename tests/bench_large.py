@@ -3,8 +3,8 @@
     python tests/bench_large.py [seeds]
 
 RMS and largest error of the trajectory after alignment, that of the odometry beside it, closures that hold and that
-were refused, how well its covariance tells the error (normalised squared error over 3, of every 50th pose in the frame
-of the first), seconds of the processor and scans each of them, and peak memory of the process with the simulation.
+were refused, how well its covariance tells the error (normalised squared error over 3, as in
+bench_nees), seconds of the processor and scans each of them, and peak memory of the process with the simulation.
 """
 
 import resource
@@ -13,10 +13,9 @@ import time
 from dataclasses import replace
 
 import numpy as np
+from bench_nees import normalised_squared_error
 
-from bsmap_cli.core import se2
 from bsmap_cli.evaluate import align
-from bsmap_cli.model import Trajectory
 from bsmap_cli.params import SimulateParams, SlamParams
 from bsmap_cli.simulate import simulate_scene
 from bsmap_cli.slam import run_slam
@@ -42,24 +41,15 @@ def row(factor, seed):
     seconds = time.process_time() - start
     odometry = replace(slam.trajectory, poses=log.odometry)
     errors, raw = (align(found, truth) for found in (slam.trajectory, odometry))
+    nees = normalised_squared_error(slam.trajectory, truth)
     held = np.count_nonzero(slam.closures.held)
     n = len(log.horizontal.time_ns)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return (
         f"{factor:8.0f} {seed:5d} {n:6d} {errors.rms:6.3f} {errors.maximum:7.3f} {raw.rms:13.2f}"
-        f" {held:5d} {len(slam.closures.held) - held:7d} {normalised(slam.trajectory, truth):7.2f} {seconds:7.1f}"
+        f" {held:5d} {len(slam.closures.held) - held:7d} {nees:7.2f} {seconds:7.1f}"
         f" {n / seconds:8.0f} {peak:8.0f}"
     )
-
-
-def normalised(found: Trajectory, truth: Trajectory):
-    """Mean squared error of every 50th pose over its covariance and 3."""
-    at = np.searchsorted(truth.time_ns, found.time_ns)
-    error = found.poses - se2.between(truth.poses[at[0]], truth.poses[at])
-    error[:, 2] = se2.wrap(error[:, 2])
-    some = np.arange(50, len(error), 50)
-    solved = np.linalg.solve(found.covariances[some], error[some, :, None])[..., 0]
-    return np.einsum("ni,ni->n", error[some], solved).mean() / 3
 
 
 if __name__ == "__main__":

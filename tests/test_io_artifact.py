@@ -87,6 +87,14 @@ def test_fingerprint_changes_with_stage_parameters_and_content_only(log: Path) -
     assert artifact.fingerprint("fit", parameters, [log]) != first
 
 
+def test_fingerprint_depends_on_the_code_of_model_parameters_and_stage() -> None:
+    package = Path(artifact.__file__).parent.parent
+    names = {path.relative_to(package).as_posix() for path in artifact.code_of("merge")}
+    assert {"model/surfaces.py", "params.py", "core/bspline.py", "io/artifact.py"} <= names
+    assert {"merge/faces.py", "fit/heights.py"} <= names
+    assert not any(name.startswith(("slam/", "cli/")) for name in names)
+
+
 def test_fingerprint_of_a_missing_input_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(MissingInputError, match=r"no\.mcap: No such file"):
         artifact.fingerprint("slam", {}, [tmp_path / "no.mcap"])

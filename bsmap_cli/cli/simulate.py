@@ -17,7 +17,7 @@ from bsmap_cli.track import Track
 @parameters(SimulateParams)
 @force_option
 def simulate(scene: str, output: Path | None, simulate_params: SimulateParams, force: bool) -> None:
-    """Log of a simulated robot in SCENE (room, corridor, loop, walls, steps), its truth in FILE.truth.tum and .ply."""
+    """Log of a simulated robot in SCENE (room, corridor, loop, walls, steps, office), with FILE.truth.tum and .ply."""
 
     def compute(track: Track) -> Result:
         from bsmap_cli.io.log import write_scans

@@ -34,7 +34,7 @@ _PROVENANCE = re.compile(r'bsmap-provenance"?\s*:\s*(?={)')
 # Other programs' PLY readers take lines of 511 characters (VCG in MeshLab) or 1023 (RPly in Open3D, CloudCompare).
 COMMENT_WIDTH = 400
 _CONTINUED = "bsmap+:"
-# A stage's code beside core/, io/, model.py and params.py, where it is not just the room of its name.
+# A stage's code beside core/, io/, model/ and params.py, where it is not just the room of its name.
 _ROOMS = {"merge": ("merge", "fit")}
 
 
@@ -129,15 +129,21 @@ def file_digest(path: Path | str) -> str:
 @cache
 def code_digest(stage: str) -> str:
     """SHA-256 of the sources that a stage's result depends on; the stage's room is the first word of its name."""
-    stage, package = stage.split()[0], Path(__file__).resolve().parent.parent
-    sources = [package / "model.py", package / "params.py"]
-    for room in ("core", "io", *_ROOMS.get(stage, (stage,))):
-        sources += [package / f"{room}.py", *(package / room).rglob("*.py")]
+    package = Path(__file__).resolve().parent.parent
     digest = hashlib.sha256()
-    for source in sorted(s for s in sources if s.is_file()):
+    for source in code_of(stage):
         digest.update(f"{source.relative_to(package).as_posix()}\n".encode())
         digest.update(source.read_bytes())
     return digest.hexdigest()
+
+
+def code_of(stage: str) -> list[Path]:
+    """Sources that a stage's result depends on."""
+    stage, package = stage.split()[0], Path(__file__).resolve().parent.parent
+    sources: list[Path] = []
+    for room in ("core", "io", "model", "params", *_ROOMS.get(stage, (stage,))):
+        sources += [package / f"{room}.py", *(package / room).rglob("*.py")]
+    return sorted(source for source in sources if source.is_file())
 
 
 @contextmanager

@@ -28,7 +28,7 @@
                              no trims: the whole surface; else what the loops together wind around counter-clockwise
      "residuals": {"points", "mean", "rms", "percentile_95", "maximum"}}
 
-model.py tells what each of them means. Numbers are rounded to what they are worth, for the bytes of a map matter:
+model/surfaces.py tells what each is. Numbers are rounded to what they are worth, for the bytes of a map matter:
 coordinates and correlations to 1e-6, knots to 1e-10, creases, corners and parameters of trims to 1e-5, covariances to
 4 (those of heights, which are differences of large numbers, to 7) and residuals to 6 significant digits. A map that was
 read is written again byte for byte.

@@ -83,16 +83,16 @@ class _Rows(NamedTuple):
 
 def _rows(one: Told, joined: Joined, place: Mapping[str, list[int]]) -> _Rows:
     N = one.root @ (one.carry @ basis_matrix(joined.field.knots, one.uv))
-    G = np.zeros((len(N), 1 + max(max(some) for some in place.values())))
-    first = 0
+    used = sorted({column for part in one.pose for column in place.get(part.data_set, ())})
+    at = {column: number for number, column in enumerate(used)}
+    G, first = np.zeros((len(N), len(used))), 0
     for part in one.pose:
-        width = unit_errors(part).shape[1]
+        width = 3 if part.modes is None else 3 + part.modes.shape[1]
         if part.data_set in place:
             # A mode has an effect by way of each data set of its trajectory.
-            G[:, place[part.data_set]] += one.by_pose[:, first : first + width]
+            G[:, [at[column] for column in place[part.data_set]]] += one.by_pose[:, first : first + width]
         first += width
-    used = sorted({column for part in one.pose for column in place.get(part.data_set, ())})
-    return _Rows(N, one.root @ G[:, used], one.root @ one.heights, used)
+    return _Rows(N, one.root @ G, one.root @ one.heights, used)
 
 
 def _reduced(

@@ -37,6 +37,10 @@ def assert_same(state: filter.FilterState, twin: DenseLineFilter, tolerance: flo
     np.testing.assert_allclose(full_covariance(state), twin.P, atol=tolerance)
 
 
+def update(state: filter.FilterState, line: int, z: np.ndarray, R: np.ndarray) -> tuple[filter.FilterState, float]:
+    return filter.update(state, np.array([line]), z[None], R[None])
+
+
 def test_expected_lines_are_the_lines_seen_from_the_pose():
     """Points of a map line, carried into the robot's frame, lie on the expected line."""
     rng = np.random.default_rng(0)
@@ -111,7 +115,7 @@ def test_blocks_equal_dense_filter_over_many_steps():
             seen = filter.expected_lines(state.pose, state.lines[line : line + 1])[0]
             R = random_covariance(rng, 2, 0.01)
             z = seen + rng.multivariate_normal(np.zeros(2), R)
-            state, distance = filter.update(state, line, z, R)
+            state, distance = update(state, line, z, R)
             assert distance == pytest.approx(twin.update(line, z, R), rel=1e-6, abs=1e-9)
         if count < 45 and rng.uniform() < 0.4:
             z, R = rng.uniform([-np.pi, 0.5], [np.pi, 6.0]), random_covariance(rng, 2, 0.02)
@@ -128,6 +132,33 @@ def test_blocks_equal_dense_filter_over_many_steps():
             twin.constrain_equal(first, second, noise)
     assert_same(state, twin)
     assert state.size > filter.GROWTH  # the buffers have grown on the way
+
+
+def test_pairs_of_a_scan_correct_as_one_measurement():
+    """Two segments of one line and one of another: mean and covariance of the dense update with all rows stacked."""
+    rng = np.random.default_rng(3)
+    state, _ = started(rng, 6)
+    mean, P, lines = state.mean[: state.size].copy(), full_covariance(state), np.array([4, 1, 4])
+    R = np.array([random_covariance(rng, 2, 0.01) for _ in lines])
+    seen = filter.expected_lines(state.pose, state.lines[lines])
+    by_pose, by_line = filter.line_jacobians(state.pose, state.lines[lines, 0])
+    H, noise = np.zeros((6, state.size)), np.zeros((6, 6))
+    for k, line in enumerate(lines):
+        H[2 * k : 2 * k + 2, :3], H[2 * k : 2 * k + 2, 3 + 2 * line : 5 + 2 * line] = by_pose[k], by_line[k]
+        noise[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = R[k]
+    innovation = 0.01 * rng.normal(size=(3, 2))
+    S = H @ P @ H.T + noise
+    K = P @ H.T @ np.linalg.inv(S)
+    state, distance = filter.update(state, lines, seen + innovation, R)
+    assert distance == pytest.approx(innovation.ravel() @ np.linalg.solve(S, innovation.ravel()))
+    np.testing.assert_allclose(state.mean[: state.size], mean + K @ innovation.ravel(), atol=1e-10)
+    np.testing.assert_allclose(full_covariance(state), P - K @ S @ K.T, atol=1e-12)
+
+
+def test_scan_without_pairs_changes_nothing():
+    state, _ = started(np.random.default_rng(4), 2)
+    none = np.zeros(0, int)
+    assert filter.update(state, none, np.zeros((0, 2)), np.zeros((0, 2, 2))) == (state, 0.0)
 
 
 def test_removing_any_line_leaves_the_others_as_they_are():
@@ -149,7 +180,7 @@ def test_update_never_increases_trace():
     for _ in range(300):
         line, R = int(rng.integers(20)), random_covariance(rng, 2, rng.uniform(0.001, 0.1))
         seen = filter.expected_lines(state.pose, state.lines[line : line + 1])[0]
-        state, _ = filter.update(state, line, seen + rng.normal(size=2) * 0.01, R)
+        state, _ = update(state, line, seen + rng.normal(size=2) * 0.01, R)
         less = np.trace(full_covariance(state))
         assert less <= trace * (1 + 1e-12)
         trace = less
@@ -166,7 +197,7 @@ def test_covariance_stays_positive_semidefinite_over_thousands_of_updates():
         state = filter.predict(state, np.array([0.02, 0, 0.001]), np.diag([1e-3, 1e-3, 1e-4]) ** 2)
         line, R = int(rng.integers(40)), np.diag([1e-4, 1e-4]) ** 2
         seen = filter.expected_lines(state.pose, state.lines[line : line + 1])[0]
-        state, _ = filter.update(state, line, seen + 1e-4 * rng.normal(size=2), R)
+        state, _ = update(state, line, seen + 1e-4 * rng.normal(size=2), R)
     P = full_covariance(state)
     scale = np.sqrt(np.diag(P))
     assert np.all(np.isfinite(P))
@@ -190,7 +221,7 @@ def test_tracking_holds_far_from_the_origin(offset):
         state = filter.predict(state, u + [2e-3, 1e-3, 1e-3] * rng.normal(size=3), np.diag([2e-3, 1e-3, 1e-3]) ** 2)
         for line in rng.choice(8, 3, replace=False):
             z = filter.expected_lines(truth, lines[line : line + 1])[0] + noise * rng.normal(size=2)
-            state, _ = filter.update(state, int(line), z, np.diag(noise) ** 2)
+            state, _ = update(state, line, z, np.diag(noise) ** 2)
     error = se2.between(truth, state.pose)
     assert np.hypot(*error[:2]) < 0.008
     assert abs(error[2]) < 0.003
@@ -199,7 +230,7 @@ def test_tracking_holds_far_from_the_origin(offset):
 def test_angles_are_compared_round_the_circle():
     state = filter.initial_state(np.array([0, 0, np.pi - 0.01]), np.diag([0.1, 0.1, 0.1]) ** 2)
     state = filter.augment(state, np.array([np.pi - 0.02, 2.0]), np.eye(2) * 1e-6)
-    state, distance = filter.update(state, 0, np.array([-np.pi - 0.02, 2.0]), np.eye(2) * 1e-4)
+    state, distance = update(state, 0, np.array([-np.pi - 0.02, 2.0]), np.eye(2) * 1e-4)
     assert distance < 1e-6
     assert -np.pi <= state.pose[2] < np.pi
 
@@ -216,7 +247,7 @@ def test_tied_lines_become_one_and_the_tie_has_its_noise():
 def test_innovation_covariance_that_is_not_positive_is_an_error():
     state, _ = started(np.random.default_rng(9), 1)
     with pytest.raises(BsmapError, match="no longer positive definite"):
-        filter.update(state, 0, np.array([0.0, 1.0]), -np.eye(2))
+        update(state, 0, np.array([0.0, 1.0]), -np.eye(2))
 
 
 def test_filter_is_consistent_on_data_of_its_own_model():
@@ -237,7 +268,7 @@ def test_filter_is_consistent_on_data_of_its_own_model():
             state = filter.predict(state, u + rng.multivariate_normal(np.zeros(3), Q), Q)
             for k, line in enumerate(lines):
                 z = filter.expected_lines(truth, line[None])[0] + rng.multivariate_normal(np.zeros(2), R)
-                state, distance = filter.update(state, k, z, R)
+                state, distance = update(state, k, z, R)
                 nis.append(distance)
         error = se2.wrap(state.pose - truth)
         nees.append(error @ np.linalg.solve(filter.pose_covariance(state), error))

@@ -69,6 +69,24 @@ def test_long_chain_is_interpolated_between_poses_that_are_exact():
     np.testing.assert_allclose(found.poses, expected, rtol=1e-6, atol=1e-12)
 
 
+def test_lines_of_a_long_chain_are_as_the_dense_inverse_tells(monkeypatch):
+    """Poses err alike from one to the next, so that those between the ones solved for may be interpolated."""
+    n, lines, step = 200, 30, np.diag([1e4, 1e4, 1e6])
+    rng = np.random.default_rng(3)
+    J = sparse.diags_array([np.ones(n - 1), -np.ones(n - 2)], offsets=[0, -1], format="csc")
+    information = np.zeros((3 * (n - 1) + 2 * lines,) * 2)
+    information[: 3 * (n - 1), : 3 * (n - 1)] = sparse.kron(J.T @ J, step).toarray()
+    for line in range(lines):
+        for pose in np.arange(5) + rng.integers(n - 6):
+            columns = np.r_[3 * pose + np.arange(3), 3 * (n - 1) + 2 * line + np.arange(2)]
+            rows = np.c_[rng.normal(size=(2, 3)), np.eye(2)]
+            information[np.ix_(columns, columns)] += 1e2 * rows.T @ rows
+    monkeypatch.setattr("bsmap_cli.slam.marginals.MOST_POSES", 60)
+    found = marginals(sparse.csc_matrix(information), n, lines).lines
+    wanted = blocks(np.linalg.inv(information), 3 * (n - 1), lines, 2)
+    np.testing.assert_allclose(np.trace(found, axis1=1, axis2=2), np.trace(wanted, axis1=1, axis2=2), rtol=0.05)
+
+
 def test_modes_are_what_the_errors_of_all_poses_have_in_common():
     """A common shift of all poses but the first, and noise of their own: one mode, the same for all."""
     n, common, own = 40, np.array([0.05, 0.03, 0.01]), np.array([0.002, 0.002, 0.001])

@@ -53,12 +53,12 @@ def test_extents_in_map_are_those_of_the_carried_end_points(seed):
 def test_extend_covers_what_was_seen_and_counts_each_scan_once():
     state, landmarks = stored([(0, 3), (np.pi / 2, 2)], [(-1, 1), (-1, 1)])
     seen = segments_of([(0, 3), (0, 3), (np.pi / 2, 2)], [(-2, -1.5), (0.5, 1.7), (-0.5, 0.5)])
-    after = upkeep.extend(state, landmarks, seen, [(0, 0), (1, 0), (2, 1)], step=9)
+    after = upkeep.extend(state, landmarks, seen, np.array([0, 1, 2]), np.array([0, 0, 1]), step=9)
     np.testing.assert_allclose(after.extents, [(-2, 1.7), (-1, 1)], atol=1e-12)
     assert after.hits.tolist() == [6, 6]
     assert after.last_seen.tolist() == [9, 9]
     assert landmarks.last_seen.tolist() == [0, 0]
-    assert upkeep.extend(state, landmarks, seen, [], step=9) is landmarks
+    assert upkeep.extend(state, landmarks, seen, np.zeros(0, int), np.zeros(0, int), step=9) is landmarks
 
 
 def test_extend_measures_along_the_stored_line_from_any_pose():
@@ -66,7 +66,7 @@ def test_extend_measures_along_the_stored_line_from_any_pose():
     pose = np.array([5.0, 4.0, 2.0])
     state.mean[:3] = pose
     line = filter.expected_lines(pose, state.lines)[0]
-    after = upkeep.extend(state, landmarks, segments_of([line], [(-2, 2)]), [(0, 0)], 1)
+    after = upkeep.extend(state, landmarks, segments_of([line], [(-2, 2)]), np.array([0]), np.array([0]), 1)
     along = ends(pose, line, (-2, 2)) @ [-np.sin(0.4), np.cos(0.4)]
     np.testing.assert_allclose(after.extents[0], [min(3, along.min()), max(4, along.max())], atol=1e-12)
 

@@ -15,14 +15,21 @@ def compose(a: Array, b: Array) -> Array:
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
     x = a[..., 0] + c * b[..., 0] - s * b[..., 1]
     y = a[..., 1] + s * b[..., 0] + c * b[..., 1]
-    return np.stack([x, y, wrap(a[..., 2] + b[..., 2])], axis=-1)
+    return _pose(x, y, a[..., 2] + b[..., 2])
 
 
 def between(a: Array, b: Array) -> Array:
     """Pose(s) (..., 3) of b in the frame of a: compose(a, between(a, b)) = b."""
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
     dx, dy = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
-    return np.stack([c * dx + s * dy, c * dy - s * dx, wrap(b[..., 2] - a[..., 2])], axis=-1)
+    return _pose(c * dx + s * dy, c * dy - s * dx, b[..., 2] - a[..., 2])
+
+
+def _pose(x: Array, y: Array, theta: Array) -> Array:
+    """(..., 3) with theta wrapped. Written in place: np.stack costs as much as all else for a single pose."""
+    out = np.empty((*np.shape(theta), 3))
+    out[..., 0], out[..., 1], out[..., 2] = x, y, wrap(theta)
+    return out
 
 
 def compose_jacobians(a: Array, b: Array) -> tuple[Array, Array]:

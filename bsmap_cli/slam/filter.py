@@ -1,7 +1,7 @@
-"""Line EKF, method.md section 2 (Eq. 6-15): predict, update by one pair or one constraint, augment, remove.
+"""Line EKF, method.md section 2 (Eq. 6-15): predict, update by a scan's pairs or a constraint, augment, remove.
 
-The covariance is kept in the lower triangle of a Fortran-ordered square with room to grow: a pair changes it by a
-downdate of rank 2 (BLAS dsyrk) in place, which is fast and cannot lose symmetry. Hence the functions reuse the
+The covariance is kept in the lower triangle of a Fortran-ordered square with room to grow: k pairs change it by a
+downdate of rank 2 k (BLAS dsyrk) in place, which is fast and cannot lose symmetry. Hence the functions reuse the
 buffers: a state given to one of them must not be used afterwards, only the one returned.
 """
 
@@ -103,18 +103,28 @@ def line_jacobians(pose: Array, alpha: Array) -> tuple[Array, Array]:
     return by_pose, by_line
 
 
-def update(state: FilterState, line: int, observed: Array, noise: Array) -> tuple[FilterState, float]:
-    """Correct by one matched pair, linearised at the state as it is now, Eq. (11)-(15).
+def update(state: FilterState, lines: IntArray, observed: Array, noise: Array) -> tuple[FilterState, float]:
+    """Correct by the matched pairs of a scan at once, linearised at the state as it is, Eq. (11)-(15).
 
-    observed : (2,) alpha, r in base_link.  noise : (2, 2).  Returns the state and the normalised innovation squared.
+    lines : (k,).  observed : (k, 2) alpha, r in base_link.  noise : (k, 2, 2), independent of each other.
+    Returns the state and the normalised innovation squared.
     """
-    first = 3 + 2 * line
-    by_pose, by_line = line_jacobians(state.pose, state.mean[first])
-    innovation = observed - expected_lines(state.pose, state.mean[None, first : first + 2])[0]
-    innovation[0] = se2.wrap(innovation[0])
-    cross = _columns(state, 0, 3) @ by_pose.T + _columns(state, first, 2) @ by_line.T
-    S = by_pose @ cross[:3] + by_line @ cross[first : first + 2] + noise
-    return _correct(state, cross, S, innovation)
+    k = len(lines)
+    if k == 0:
+        return state, 0.0
+    seen = state.lines[lines]
+    by_pose, by_line = line_jacobians(state.pose, seen[:, 0])
+    innovation = observed - expected_lines(state.pose, seen)
+    innovation[:, 0] = se2.wrap(innovation[:, 0])
+    first = 3 + 2 * lines
+    cross = _columns(state, 0, 3) @ by_pose.reshape(2 * k, 3).T
+    for pair, column in enumerate(first.tolist()):
+        cross[:, 2 * pair : 2 * pair + 2] += _columns(state, column, 2) @ by_line[pair].T
+    of_lines = cross[first[:, None] + np.arange(2)]
+    S = by_pose.reshape(2 * k, 3) @ cross[:3] + (by_line @ of_lines).reshape(2 * k, 2 * k)
+    on_diagonal = S.reshape(k, 2, k, 2)
+    on_diagonal[np.arange(k), :, np.arange(k)] += noise
+    return _correct(state, cross, S, innovation.ravel())
 
 
 def constrain_equal(state: FilterState, first: int, second: int, noise: Array) -> FilterState:

@@ -1,4 +1,4 @@
-"""Marginal covariances out of the smoothed information matrix, by solving for the columns that are asked for."""
+"""Marginal covariances out of the smoothed information: columns of poses solved for, the rest by way of these."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -44,10 +44,29 @@ def marginals(information: sparse.csc_matrix, poses: int, lines: int) -> Margina
     own, following, joint = _of_poses(factors, 3 * (at - 1), 3 * (poses - 2))
     every, after, modes = (_between(known, _with_first(part), poses) for part in (own, following, _modes(joint)))
     after[-1] = 0.0
-    first_line = 3 * (poses - 1) + 2 * np.arange(lines)
-    blocks = [_block(solved, first_line[some]) for some, solved in _solved(factors, first_line, 2)]
-    of_lines = np.concatenate([np.zeros((0, 2, 2)), *blocks])
-    return Marginals(_symmetric(every), after, _symmetric(of_lines), modes)
+    return Marginals(_symmetric(every), after, _symmetric(_of_lines(information, joint, at, poses)), modes)
+
+
+def _of_lines(information: sparse.csc_matrix, joint: Array, at: IntArray, poses: int) -> Array:
+    """(m, 2, 2) of the lines: what the poses that saw them leave, and what these are off by (Schur complement).
+
+    joint : (3 k, 3 k) covariance of poses `at` (k,); those between err by shares of their neighbours' errors.
+    """
+    first = 3 * (poses - 1)
+    of_lines = information[first:, first:]
+    diagonal, beside = of_lines.diagonal(), of_lines.diagonal(1)[::2]
+    left = np.linalg.inv(np.stack([diagonal[::2], beside, beside, diagonal[1::2]], axis=1).reshape(-1, 2, 2))
+    if len(at) == 0:
+        return left
+    every = np.arange(1, poses)
+    after = np.searchsorted(at, every).clip(min(1, len(at) - 1))
+    before = np.maximum(after - 1, 0)
+    share = np.where(after > before, (every - at[before]) / np.maximum(at[after] - at[before], 1), 1.0)
+    rows, columns = np.tile(every - 1, 2), np.concatenate([before, after])
+    shares = sparse.coo_array((np.concatenate([1.0 - share, share]), (rows, columns)), (poses - 1, len(at)))
+    by_poses = np.asarray((information[first:, :first] @ sparse.kron(shares, np.eye(3))).todense())
+    by_poses = left @ by_poses.reshape(-1, 2, len(joint))
+    return left + (by_poses @ joint) @ np.swapaxes(by_poses, 1, 2)
 
 
 def _with_first(blocks: Array) -> Array:
@@ -72,7 +91,7 @@ def _of_poses(factors: SuperLU, starts: IntArray, last: int) -> tuple[Array, Arr
     """
     k = len(starts)
     own, following, joint = np.empty((k, 3, 3)), np.empty((k, 3, 3)), np.empty((k, 3, k, 3))
-    for some, solved in _solved(factors, starts, 3):
+    for some, solved in _solved(factors, starts):
         joint[:, :, some] = solved[starts[:, None] + np.arange(3)]
         own[some] = _block(solved, starts[some])
         following[some] = _block(solved, np.minimum(starts[some] + 3, last))
@@ -80,17 +99,17 @@ def _of_poses(factors: SuperLU, starts: IntArray, last: int) -> tuple[Array, Arr
 
 
 def _block(solved: Array, rows: IntArray) -> Array:
-    """Blocks (j, size, size) of columns (n, j, size), each in the rows that begin at `rows` (j,)."""
-    axes = np.arange(solved.shape[2])
+    """Blocks (j, 3, 3) of columns (n, j, 3), each in the rows that begin at `rows` (j,)."""
+    axes = np.arange(3)
     return np.asarray(solved[rows[:, None, None] + axes, np.arange(len(rows))[:, None, None], axes[:, None]])
 
 
-def _solved(factors: SuperLU, starts: IntArray, size: int) -> Iterator[tuple[slice, Array]]:
-    """Columns (n, j, size) of the inverse that begin at `starts` (k,), some at a time."""
-    at_once = COLUMNS // size
+def _solved(factors: SuperLU, starts: IntArray) -> Iterator[tuple[slice, Array]]:
+    """Columns (n, j, 3) of the inverse that begin at `starts` (k,), some at a time."""
+    at_once = COLUMNS // 3
     for first in range(0, len(starts), at_once):
         some = slice(first, min(first + at_once, len(starts)))
-        rows = starts[some, None] + np.arange(size)
+        rows = starts[some, None] + np.arange(3)
         side = np.zeros((factors.shape[0], rows.size))
         side[rows.ravel(), np.arange(rows.size)] = 1.0
         yield some, factors.solve(side).reshape(-1, *rows.shape)

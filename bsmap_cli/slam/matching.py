@@ -183,7 +183,7 @@ def _turn(theta: float) -> Array:
 def _has_moved(before: Array, pose: Array) -> bool:
     """Whether points may have other partners now than where they were paired."""
     x, y, theta = (pose - before).tolist()
-    return abs(x) + abs(y) > 0.01 or abs(theta) > 0.003
+    return abs(x) + abs(y) > 0.02 or abs(theta) > 0.006
 
 
 def _pair(source: OrientedPoints, target: Target, pose: Array, reach: float) -> _Pairs:

@@ -26,8 +26,6 @@ from bsmap_cli.slam.upkeep import (
 )
 from bsmap_cli.track import Track
 
-"""Scans whose segments are extracted at once: enough to spread the cost, few enough to stay in the cache."""
-
 
 class Step(NamedTuple):
     """The map after a scan, and what the scan did: new segments, matched pairs, normalised innovation squared."""
@@ -65,28 +63,26 @@ def run_paper(log: ScanLog, range_sigma: float, params: SlamParams, track: Track
 
 
 def line_step(state: FilterState, landmarks: Landmarks, segments: Segments, step: int, params: SlamParams) -> Step:
-    """Match the segments, correct pair by pair, store what is new, join what is one, forget what does not last."""
+    """Match the segments, correct by them, store what is new, join what is one, forget what does not last."""
     candidates = find_candidates(state, landmarks.extents, segments, params.gate, params.overlap_margin)
     order = np.argsort(_bearings(segments), kind="stable").tolist()
     chosen = partial_compatibility(candidates, order, params.group_size, params.gate)
-    pairs = [(int(candidates.segment[c]), int(candidates.line[c])) for c in chosen]
-    nis, before = 0.0, state.lines.copy()
-    for segment, line in pairs:
-        state, distance = filter.update(state, line, segments.parameters[segment], segments.covariances[segment])
-        nis += distance
-    landmarks = extend(state, follow(landmarks, before, state.lines), segments, pairs, step)
+    segment, line = candidates.segment[chosen], candidates.line[chosen]
+    before = state.lines.copy()
+    state, nis = filter.update(state, line, segments.parameters[segment], segments.covariances[segment])
+    landmarks = extend(state, follow(landmarks, before, state.lines), segments, segment, line, step)
     # A segment that fits a line alone but not jointly is neither trusted nor stored a second time.
     unknown = np.setdiff1d(np.arange(len(segments.scan)), candidates.segment)
     first_new = len(landmarks.hits)
-    for segment in unknown:
-        state = filter.augment(state, segments.parameters[segment], segments.covariances[segment])
+    for new in unknown:
+        state = filter.augment(state, segments.parameters[new], segments.covariances[new])
     seen = extents_in_map(state.pose, segments.parameters[unknown], segments.extents[unknown])
     landmarks = append(landmarks, seen, step)
-    touched = sorted({line for _, line in pairs} | set(range(first_new, len(landmarks.hits))))
+    touched = sorted({*line.tolist(), *range(first_new, len(landmarks.hits))})
     same = np.diag([params.line_angle_floor, params.line_offset_floor]) ** 2
     state, landmarks = join_lines(state, landmarks, touched, params.gate, params.overlap_margin, same)
     state, landmarks = prune(state, landmarks, step, params.tentative_hits, params.tentative_scans)
-    return Step(state, landmarks, len(pairs), nis)
+    return Step(state, landmarks, len(chosen), nis)
 
 
 def _bearings(segments: Segments) -> Array:

@@ -20,6 +20,8 @@ from bsmap_cli.slam.sightings import Sightings, by_scatter, extents_and_hits, ma
 
 ROUNDS = 3
 ITERATIONS = 5
+CONVERGED, SETTLED = 1e-4, 0.01
+"""Metres and radians: poses that move less are found; relative change of the variances' scales at which these are."""
 POSE_SPREAD = (0.05, 0.015)
 """Metres and radians by which a key pose may be off when segments are matched to lines for the first time."""
 PROBES = 16
@@ -95,7 +97,7 @@ def smooth(
             poses, parameters, largest = _stepped(poses, parameters, factors.solve(side))
             scales = scales * _variance_components(problem.scaled(scales), poses, parameters, factors)
             scales = np.maximum(scales, [LEAST_STEP_SCALE, 0.0, 0.0])
-            if largest < 1e-5:
+            if largest < CONVERGED:
                 break
         extents, hits = extents_and_hits(poses, parameters, sightings, segments)
         spread = (POSE_SPREAD[0] / 2, POSE_SPREAD[1] / 2)
@@ -110,10 +112,13 @@ def _honest_information(poses: Array, lines: Array, problem: _Problem) -> tuple[
     for _ in range(ITERATIONS):
         information, _ = _normal_equations(poses, lines, problem.scaled(scales))
         factors = posegraph.factorise(information)
-        scales = scales * _variance_components(problem.scaled(scales), poses, lines, factors)
+        change = _variance_components(problem.scaled(scales), poses, lines, factors)
+        before, scales = scales, scales * change
         # What odometry is off by in a few steps says little of its drift, which is systematic; and that neighbouring
         # matches, which share most of their points, agree does not make them better.
         scales = np.maximum(scales, [LEAST_ODOMETRY_SCALE, 1.0, 0.0])
+        if np.abs(np.log(scales / before)).max() < SETTLED:
+            break
     return _normal_equations(poses, lines, problem.scaled(scales))[0], scales
 
 
@@ -133,12 +138,12 @@ def _normal_equations(poses: Array, lines: Array, problem: _Problem) -> tuple[sp
 
 
 def _stepped(poses: Array, lines: Array, step: Array) -> tuple[Array, Array, float]:
-    """Poses and lines after a step of all unknowns but the first pose, and the largest change."""
+    """Poses and lines after a step of all unknowns but the first pose, and the poses' largest change."""
     step = np.concatenate([np.zeros(3), step])
     n = len(poses)
     poses, lines = poses + step[: 3 * n].reshape(-1, 3), lines + step[3 * n :].reshape(-1, 2)
     poses[:, 2] = se2.wrap(poses[:, 2])
-    return poses, lines, float(np.abs(step).max(initial=0.0))
+    return poses, lines, float(np.abs(step[: 3 * n]).max())
 
 
 def _variance_components(problem: _Problem, poses: Array, lines: Array, factors: SuperLU) -> Array:

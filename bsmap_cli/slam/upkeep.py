@@ -8,7 +8,7 @@ from bsmap_cli.core import se2
 from bsmap_cli.core.gaussian import chi2_gate
 from bsmap_cli.core.table import take
 from bsmap_cli.model import Array, IntArray, LineMap
-from bsmap_cli.slam.filter import FilterState, constrain_equal, gather, line_covariances, remove
+from bsmap_cli.slam.filter import FilterState, constrain_equal, line_covariances, remove
 from bsmap_cli.slam.segments import Segments
 
 JOIN_ANGLE = 0.1
@@ -40,12 +40,11 @@ def extents_in_map(pose: Array, parameters: Array, extents: Array) -> Array:
 
 
 def extend(
-    state: FilterState, landmarks: Landmarks, segments: Segments, pairs: list[tuple[int, int]], step: int
+    state: FilterState, landmarks: Landmarks, segments: Segments, segment: IntArray, line: IntArray, step: int
 ) -> Landmarks:
-    """Landmarks after the matched pairs (segment, line) of a step: extents cover what was seen, hits count it."""
-    if not pairs:
+    """Landmarks after the matched pairs, segment (k,) and line (k,), of a step: extents cover what they saw."""
+    if len(line) == 0:
         return landmarks
-    segment, line = np.array(pairs).T
     extents, hits, last_seen = landmarks.extents.copy(), landmarks.hits.copy(), landmarks.last_seen.copy()
     alpha = segments.parameters[segment, 0]
     n, t = np.stack([np.cos(alpha), np.sin(alpha)], -1), np.stack([-np.sin(alpha), np.cos(alpha)], -1)
@@ -122,27 +121,31 @@ def _first_joinable(
     state: FilterState, landmarks: Landmarks, touched: list[int], gate: float, margin: float, noise: Array
 ) -> tuple[int, int] | None:
     """Lines to join, the smaller index first; None when no pair passes."""
-    for line in touched:
-        for other in _near_lines(state.lines, landmarks.extents, line, margin):
-            first, second = sorted((line, int(other)))
-            index = np.array([3 + 2 * first, 4 + 2 * first, 3 + 2 * second, 4 + 2 * second])
-            C = gather(state.covariance, index)
-            difference = state.lines[first] - state.lines[second]
-            difference[0] = se2.wrap(difference[0])
-            S = C[:2, :2] + C[2:, 2:] - C[:2, 2:] - C[2:, :2] + noise
-            if difference @ np.linalg.solve(S, difference) < chi2_gate(gate, 2):
-                return first, second
-    return None
+    pairs = _near_lines(state.lines, landmarks.extents, np.array(touched, int), margin)
+    if len(pairs) == 0:
+        return None
+    index = (3 + 2 * pairs[:, :, None] + np.arange(2)).reshape(-1, 4)
+    rows, columns = np.maximum(index[:, :, None], index[:, None]), np.minimum(index[:, :, None], index[:, None])
+    C = state.covariance[rows, columns]
+    S = C[:, :2, :2] + C[:, 2:, 2:] - C[:, :2, 2:] - C[:, 2:, :2] + noise
+    difference = state.lines[pairs[:, 0]] - state.lines[pairs[:, 1]]
+    difference[:, 0] = se2.wrap(difference[:, 0])
+    distance = np.einsum("ki,ki->k", difference, np.linalg.solve(S, difference[..., None])[..., 0])
+    passing = np.flatnonzero(distance < chi2_gate(gate, 2))
+    return tuple(pairs[passing[0]].tolist()) if len(passing) else None
 
 
-def _near_lines(lines: Array, extents: Array, line: int, margin: float) -> IntArray:
-    turn = se2.wrap(lines[:, 0] - lines[line, 0])
-    begin, end = np.maximum(extents[:, 0], extents[line, 0]), np.minimum(extents[:, 1], extents[line, 1])
+def _near_lines(lines: Array, extents: Array, touched: IntArray, margin: float) -> IntArray:
+    """(k, 2) pairs of lines worth a test, the smaller first: each of `touched` in turn with the others near it."""
+    turn = se2.wrap(lines[:, 0] - lines[touched, :1])
+    begin = np.maximum(extents[:, 0], extents[touched, :1])
+    end = np.minimum(extents[:, 1], extents[touched, 1:])
     # Offset in the middle of the overlap (or of the gap); turning by a small angle moves a point at t by t times it.
-    apart = lines[:, 1] - lines[line, 1] - turn * (begin + end) / 2
+    apart = lines[:, 1] - lines[touched, 1:] - turn * (begin + end) / 2
     near = (np.abs(turn) < JOIN_ANGLE) & (np.abs(apart) < JOIN_OFFSET) & (end - begin > -margin)
-    near[line] = False
-    return np.flatnonzero(near)
+    near[np.arange(len(touched)), touched] = False
+    row, other = np.nonzero(near)
+    return np.sort(np.stack([touched[row], other], axis=1), axis=1)
 
 
 def to_line_map(state: FilterState, landmarks: Landmarks) -> LineMap:

@@ -9,9 +9,11 @@ from reference import central_differences
 
 from bsmap_cli.core import se2
 from bsmap_cli.model import LineMap
+from bsmap_cli.params import SlamParams
 from bsmap_cli.slam.posegraph import ROBUST_WIDTH, Edges
+from bsmap_cli.slam.scatter import FEWEST, LEAST_FLOOR, by_parts, by_scatter
 from bsmap_cli.slam.segments import Segments
-from bsmap_cli.slam.sightings import Sightings, by_scatter, match_all, sighting_term
+from bsmap_cli.slam.sightings import Sightings, match_all, sighting_term
 from bsmap_cli.slam.smoothing import Evidence, smooth
 
 WALLS = np.array([[0.0, 4.0], [np.pi / 2, 3.0], [np.pi, 4.0], [-np.pi / 2, 3.0], [0.0, 2.0]])
@@ -68,7 +70,7 @@ class Case:
     def smoothed(self, **changed):
         given = {"segments": self.segments, "lines": self.lines} | changed
         evidence = Evidence(self.odometry, self.none)
-        return smooth(self.start, evidence, evidence, given["segments"], given["lines"], GATE, MARGIN)
+        return smooth(self.start, evidence, evidence, given["segments"], given["lines"], SlamParams())
 
 
 def one_sighting(rng) -> Sightings:
@@ -193,3 +195,54 @@ def test_line_whose_sightings_scatter_counts_for_less_and_the_others_stay_as_the
     assert left[board].max() < 0.4
     assert left[line != 4].min() > 0.7
     assert left.max() <= 1.0
+
+
+def scattered(noise_scale: float, floor_scale: float, seed: int = 2) -> tuple[Sightings, Segments, np.ndarray]:
+    """Sightings from the origin, 30 of each of 20 lines, whose errors have noise and floor of these scales of variance.
+
+    Their segments are long or short, so that the floor or the noise prevails, and are told both with scale 1.
+    """
+    rng, floors = np.random.default_rng(seed), np.array([0.0005, 0.001])
+    line = np.tile(np.arange(20), 30)
+    m = len(line)
+    lines = np.stack([np.linspace(-3.0, 3.0, 20), np.full(20, 4.0)], axis=1)
+    noise = np.where(rng.uniform(size=m) < 0.5, 1.0, 0.1)[:, None] * [0.003, 0.005]
+    centre = rng.uniform(-5.0, 5.0, m)
+    told = noise**2 + floors**2
+    error = np.sqrt(noise_scale * noise**2 + floor_scale * floors**2) * rng.normal(size=(m, 2))
+    error[:, 1] += centre * error[:, 0]
+    covariances = np.stack(
+        [told[:, 0], centre * told[:, 0], centre * told[:, 0], told[:, 1] + centre**2 * told[:, 0]], 1
+    )
+    covariances = covariances.reshape(-1, 2, 2)
+    extents = np.stack([centre - 1.0, centre + 1.0], axis=1)
+    segments = Segments(np.zeros(m, int), lines[line] + error, covariances, extents, np.full(m, 50))
+    seen = Sightings(segments.scan, line, segments.parameters, np.linalg.inv(covariances), np.arange(m))
+    return seen, segments, lines
+
+
+@pytest.mark.parametrize("scales", [(1.0, 1.0), (0.5, 4.0), (2.0, 0.2)])
+def test_noise_and_floor_of_segments_are_told_apart_by_what_is_left_of_their_errors(scales):
+    seen, segments, lines = scattered(*scales)
+    floors = np.array([0.0005, 0.001])
+    found = np.linalg.inv(by_parts(np.zeros((1, 3)), lines, seen, segments, floors).information)
+    centre = segments.extents.mean(axis=1)
+    alpha, told = found[:, 0, 0], segments.covariances[:, 0, 0]
+    np.testing.assert_allclose(found[:, 0, 1], centre * alpha, rtol=1e-9)
+    fitted = np.linalg.lstsq(
+        np.stack([told - floors[0] ** 2, np.full(len(told), floors[0] ** 2)], 1), alpha, rcond=None
+    )[0]
+    assert fitted[1] / fitted[0] == pytest.approx(scales[1] / scales[0], rel=0.35, abs=0.1)
+
+
+def test_walls_that_are_flat_keep_a_share_of_the_floor():
+    seen, segments, lines = scattered(1.0, 0.0)
+    floors = np.array([0.0005, 0.001])
+    found = np.linalg.inv(by_parts(np.zeros((1, 3)), lines, seen, segments, floors).information)
+    assert found[:, 0, 0].min() > LEAST_FLOOR * floors[0] ** 2
+
+
+def test_few_sightings_do_not_tell_noise_from_floor():
+    seen, segments, lines = scattered(1.0, 4.0)
+    few = Sightings(*(column[: FEWEST - 1] for column in seen))
+    assert by_parts(np.zeros((1, 3)), lines, few, segments, np.array([0.0005, 0.001])) is few

@@ -20,8 +20,9 @@ from bsmap_cli.track import Track
 NO_ODOMETRY = np.array([0.1, 0.1, 0.05])
 ODOMETRY_FLOOR = np.array([0.003, 0.003, 0.002])
 """Metres and radians by which a step between key scans may be off: as it was tracked, and by odometry at the least."""
-OWN_SHARE = 1 / 20
-"""Of the variance of a step, what a single match errs by; the rest allows for what neighbours have in common."""
+OWN_SHARE, OWN_FLOOR = np.array([0.22, 0.22, 0.38]), np.array([0.0003, 0.0003, 0.0001])
+"""Of the standard deviation of a step, what a single match errs by, and that at the least (metres, radians); the rest
+of a step's allows for what neighbours have in common."""
 
 
 def run_graph(log: ScanLog, range_sigma: float, params: SlamParams, track: Track) -> SlamMap:
@@ -33,7 +34,7 @@ def run_graph(log: ScanLog, range_sigma: float, params: SlamParams, track: Track
     every = Evidence(closures.chain, closures.closures)
     odometry = _odometry_edges(log, tracking, closures.chain, params)
     distinct = Evidence(odometry, _unexplained(log, tracking, closures, segments))
-    smoothed = smooth(closures.poses, every, distinct, segments, mapped.lines, params.gate, params.overlap_margin)
+    smoothed = smooth(closures.poses, every, distinct, segments, mapped.lines, params)
     known = marginals(smoothed.information, len(smoothed.poses), len(smoothed.lines))
     trajectory = Trajectory(log.horizontal.time_ns, *_every_scan(tracking, smoothed.poses, known))
     scans = log.horizontal
@@ -117,9 +118,11 @@ def _every_scan(tracking: Tracking, poses: Array, known: Marginals) -> tuple[Arr
 def _match_covariances(tracking: Tracking, heading: Array, key: IntArray) -> Array:
     """(k, 3, 3) in map, of the tracked place of scans at `heading` (k,) after key scans `key` (k,) beside these.
 
-    That of a step from key scan to key scan, less its allowance for what neighbouring matches have in common.
+    That of a step from key scan to key scan, less its allowances for what neighbouring matches have in common.
     """
-    step = np.linalg.inv(tracking.edges.information[key]) * OWN_SHARE
+    common = np.diag(MATCH_FLOOR**2)
+    own = np.linalg.inv(tracking.edges.information[key]) - common
+    step = own * np.outer(OWN_SHARE, OWN_SHARE) + np.diag(OWN_FLOOR**2)
     R = np.zeros((len(key), 3, 3))
     R[:, 0, 0] = R[:, 1, 1] = np.cos(heading)
     R[:, 1, 0] = np.sin(heading)

@@ -12,8 +12,6 @@ from bsmap_cli.slam.segments import Segments
 
 AT_ONCE = 400
 """Segments compared with all lines at a time."""
-PRIOR_FREEDOM = 10.0
-"""Degrees of freedom with which all lines together speak for the scatter of one."""
 
 
 class Sightings(NamedTuple):
@@ -86,7 +84,7 @@ def extents_of(poses: Array, parameters: Array, extents: Array) -> Array:
     return extents + shift[:, None]
 
 
-def _errors(poses: Array, lines: Array, sightings: Sightings) -> Array:
+def errors(poses: Array, lines: Array, sightings: Sightings) -> Array:
     """(m, 2) observed alpha and r less what poses (n, 3) and lines (k, 2) make of them, Eq. (9)."""
     pose, (alpha, r) = poses[sightings.pose], lines[sightings.line].T
     turn = se2.wrap(sightings.observed[:, 0] - alpha + pose[:, 2])
@@ -94,31 +92,11 @@ def _errors(poses: Array, lines: Array, sightings: Sightings) -> Array:
     return np.stack([turn, apart], axis=1)
 
 
-def by_scatter(poses: Array, lines: Array, sightings: Sightings) -> Sightings:
-    """Sightings with less information for lines whose sightings agree less than those of the others do.
-
-    A chord of a curved wall or an edge of clutter is another one in every scan; the noise of its points does not tell
-    that, what is left of its errors does. Each line gets a variance of its own where that is above the common one,
-    drawn towards it by PRIOR_FREEDOM.
-    """
-    error = _errors(poses, lines, sightings)
-    own = np.ones(len(lines))
-    freedom = 2.0 * np.bincount(sightings.line, minlength=len(lines))
-    for _ in range(3):
-        distance = np.einsum("mi,mij,mj->m", error, sightings.information, error) / own[sightings.line]
-        distance /= 1.0 + distance / ROBUST_WIDTH
-        common = distance.sum() / max(2.0 * len(distance), 1.0)
-        each = np.bincount(sightings.line, weights=distance, minlength=len(lines))
-        own *= (each + PRIOR_FREEDOM * common) / ((freedom + PRIOR_FREEDOM) * max(common, 1e-12))
-        own = np.maximum(own, 1.0)
-    return sightings._replace(information=sightings.information / own[sightings.line, None, None])
-
-
 def sighting_term(poses: Array, lines: Array, sightings: Sightings) -> Term:
     """Blocks of the lines seen, Eq. (9)-(10), with a robust weight: a false match must not bend the map."""
     pose, (alpha, r) = poses[sightings.pose], lines[sightings.line].T
     c, s = np.cos(alpha), np.sin(alpha)
-    error = _errors(poses, lines, sightings)
+    error = errors(poses, lines, sightings)
     by_pose = np.zeros((len(r), 2, 3))  # of the error: minus the derivatives of h
     by_pose[:, 0, 2], by_pose[:, 1, 0], by_pose[:, 1, 1] = 1.0, c, s
     by_line = np.zeros((len(r), 2, 2))

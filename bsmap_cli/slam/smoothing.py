@@ -13,10 +13,12 @@ from scipy.sparse.linalg import SuperLU
 
 from bsmap_cli.core import se2
 from bsmap_cli.model import Array, IntArray, LineMap
+from bsmap_cli.params import SlamParams
 from bsmap_cli.slam import posegraph
 from bsmap_cli.slam.posegraph import Edges, Term
+from bsmap_cli.slam.scatter import weighed
 from bsmap_cli.slam.segments import Segments
-from bsmap_cli.slam.sightings import Sightings, by_scatter, extents_and_hits, match_all, sighting_term
+from bsmap_cli.slam.sightings import Sightings, extents_and_hits, match_all, sighting_term
 
 ROUNDS = 3
 ITERATIONS = 5
@@ -76,21 +78,23 @@ class _Problem(NamedTuple):
 
 
 def smooth(
-    poses: Array, every: Evidence, distinct: Evidence, segments: Segments, lines: LineMap, gate: float, margin: float
+    poses: Array, every: Evidence, distinct: Evidence, segments: Segments, lines: LineMap, params: SlamParams
 ) -> Smoothed:
     """Poses (n, 3) and lines that agree best with all evidence and with the segments of the key scans.
 
     every : all that helps to find the poses; matches among it use the same points as the lines.
     distinct : no noise twice in it; from it, at the poses found, comes the information.
-    segments : `scan` is the key pose.  gate, margin : as in the filter's association.
+    segments : `scan` is the key pose.  params : gate and margin of the filter's association, floors of a segment.
     """
+    floors = np.array([params.line_angle_floor, params.line_offset_floor])
     flip = lines.sides > 0  # back to n pointing away from the robot
     parameters = np.where(flip[:, None], lines.parameters * [1, -1] + [np.pi, 0], lines.parameters)
     extents = np.where(flip[:, None], -lines.extents[:, ::-1], lines.extents)
     spread, scales = POSE_SPREAD, np.ones(3)
     for k in range(ROUNDS):
-        sightings = match_all(poses, parameters, extents, segments, gate, margin, spread)
-        problem = _Problem(*every, sightings if k == 0 else by_scatter(poses, parameters, sightings))
+        sightings = match_all(poses, parameters, extents, segments, params.gate, params.overlap_margin, spread)
+        taken = sightings if k == 0 else weighed(poses, parameters, sightings, segments, floors)
+        problem = _Problem(*every, taken)
         for _ in range(ITERATIONS):
             information, side = _normal_equations(poses, parameters, problem.scaled(scales))
             factors = posegraph.factorise(information)
@@ -101,8 +105,8 @@ def smooth(
                 break
         extents, hits = extents_and_hits(poses, parameters, sightings, segments)
         spread = (POSE_SPREAD[0] / 2, POSE_SPREAD[1] / 2)
-    weighed = by_scatter(poses, parameters, sightings)
-    information, scales = _honest_information(poses, parameters, _Problem(*distinct, weighed))
+    taken = weighed(poses, parameters, sightings, segments, floors)
+    information, scales = _honest_information(poses, parameters, _Problem(*distinct, taken))
     return Smoothed(poses, parameters, extents, hits, information, scales)
 
 

@@ -111,7 +111,7 @@ class FitParams(Checked):
     degree_v: int = parameter(3, "Degree across the scan lines.", "", 1, 7)
     bound_u: float = parameter(0.01, "Largest error allowed along the scan lines.", "m", 1e-4)
     bound_v: float = parameter(0.05, "Largest error allowed across the scan lines.", "m", 1e-4)
-    knots_per_pass: int = parameter(1, "Knots inserted before each new fit.", "", 1, 1000)
+    knots_per_pass: int = parameter(100, "Knots inserted before each new fit.", "", 1, 1000)
     noise_margin: float = parameter(
         4.0, "Sigmas of the sensor's noise granted beyond the bounds (0: the paper's rule).", "", 0.0, 100.0
     )

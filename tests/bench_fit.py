@@ -33,15 +33,17 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from face_scenes import corridor_set
 from scenes import simulated, true_slam_map
 
 from bsmap_cli.cloud import make_cloud
 from bsmap_cli.core.bspline import TensorSpline, clamped_knots, evaluate_surface
 from bsmap_cli.core.gaussian import pack
 from bsmap_cli.evaluate import distance_to_mesh, transform_points
-from bsmap_cli.fit.curves import Rows, centripetal, fit_curves, refine_curves
+from bsmap_cli.fit.curves import Rows, centripetal, fit_curves
 from bsmap_cli.fit.lines import ScanLines, gather_lines
 from bsmap_cli.fit.movement import divide
+from bsmap_cli.fit.refinement import refine_curves
 from bsmap_cli.fit.surface import fit_scan_lines, mean_centripetal
 from bsmap_cli.params import CloudParams, FitParams
 from bsmap_cli.simulate.geometry import carve
@@ -50,7 +52,7 @@ from bsmap_cli.simulate.raycast import Caster
 
 RULES = {
     "bounds and the noise beyond them": FitParams(),
-    "bounds as they stand": FitParams(noise_margin=0.0, knots_per_pass=5),
+    "bounds as they stand": FitParams(noise_margin=0.0),
     "bounds three times as wide, as they stand": FitParams(bound_u=0.03, bound_v=0.15, noise_margin=0.0),
 }
 
@@ -97,6 +99,14 @@ class Scene(NamedTuple):
     distance: Callable
 
 
+def corridor(seed, sigma):
+    """The set of the corridor with recess, pillar and bowed wall."""
+    place = corridor_set(sigma, seed)
+    lines = gather_lines(place.cloud, divide(place.cloud.scan_poses, 5.0)[0], 8)
+    distance = lambda points: distance_to_mesh(points, place.vertices, place.triangles)  # noqa: E731
+    return Scene([lines], [centripetal(place.clean, lines.line)], [corners(place.clean, lines.line)], distance)
+
+
 def room(seed, sigma):
     """Translation sets of the room."""
     sets, u, bends = [], [], []
@@ -130,7 +140,7 @@ def tunnel(ranges, distance):
     def make(seed, sigma):
         measured = true + sigma * np.random.default_rng(seed).normal(size=len(true))
         noise = max(sigma, 1e-6) ** 2 * beams[:, :, None] * beams[:, None, :]
-        lines = ScanLines(origins + measured[:, None] * beams, scan, pack(noise))
+        lines = ScanLines(origins + measured[:, None] * beams, scan, np.tile(np.arange(541), 20), pack(noise))
         u = centripetal(origins + true[:, None] * beams, scan)
         return Scene([lines], [u], [np.zeros(len(phi), bool)], distance)
 
@@ -208,7 +218,7 @@ def ladder(work):
         for degree in (1, 2, 3):
             found = []
             for _, lines, _, _ in work:
-                fit = refine_curves(rows_along(lines, centripetal(lines.points, lines.line)), degree, bound, 1)
+                fit = refine_curves(rows_along(lines, centripetal(lines.points, lines.line)), degree, bound, 1).fit
                 found.append((fit.control_points.shape[1], 1e3 * fit.errors.mean()))
             cells.append("degree {}: {:5.1f} {:6.2f}".format(degree, *np.mean(found, axis=0)))
         print(f"bound {1e3 * bound:4.0f} mm  " + "   ".join(cells))
@@ -240,8 +250,28 @@ def with_rule(work, params, clean_parameters=False):
     return rows
 
 
+def corridor_table(seeds):
+    """Control points and errors to the truth in the corridor, by noise, degree and bounds."""
+    print(f"## corridor with recess, pillar and bowed wall, 20 x 541: means of {seeds} seeds, all points, mm")
+    print("sigma  degree  bounds along, across  control points   number  truth mean    95%    max  seconds")
+    for sigma in (0.002, 0.01, 0.03):
+        work = jobs(corridor, seeds, sigma)
+        for degree in (1, 2, 3):
+            for bound_u, bound_v in ((0.005, 0.025), (0.01, 0.05), (0.02, 0.1)):
+                params = FitParams(bound_u=bound_u, bound_v=bound_v, degree_u=degree, degree_v=degree)
+                mean = Row(*np.mean(rows := [by_rule(*job[:3], params) for job in work], axis=0))
+                print(
+                    f"{1e3 * sigma:5.0f} {degree:7d} {1e3 * bound_u:12.0f}, {1e3 * bound_v:6.0f}"
+                    f" {mean.nu:8.1f} x {mean.nv:4.1f} {np.mean([row.nu * row.nv for row in rows]):8.1f}"
+                    f" {1e3 * mean.truth_mean:11.2f} {1e3 * mean.truth_95:6.1f} {1e3 * mean.truth_max:6.1f}"
+                    f" {mean.seconds:8.2f}",
+                    flush=True,
+                )
+
+
 def main(seeds):
     logging.disable(logging.WARNING)
+    corridor_table(seeds)
     for name, make in SCENES.items():
         for sigma in (0.0, 0.01, 0.03):
             work = jobs(make, seeds, sigma)

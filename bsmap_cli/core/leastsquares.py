@@ -8,6 +8,7 @@ one system, block after block: it stays banded, and one factorisation serves the
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
+from scipy.sparse import csr_array
 
 from bsmap_cli.errors import BsmapError
 from bsmap_cli.model import Array
@@ -31,12 +32,11 @@ def normal_matrix(first: NDArray[np.intp], values: Array, columns: int) -> Array
     return bands
 
 
-def right_side(first: NDArray[np.intp], values: Array, data: Array, columns: int) -> Array:
-    """N' Q, (columns, k), of data Q (n, k)."""
-    result = np.empty((columns, data.shape[1]))
-    for k, column in enumerate(data.T):
-        result[:, k] = sum(np.bincount(first + r, values[:, r] * column, columns) for r in range(values.shape[1]))
-    return result
+def sparse_rows(first: NDArray[np.intp], values: Array, columns: int) -> csr_array:
+    """The design matrix N (n, columns), for products with many columns."""
+    n, width = values.shape
+    indices = first[:, None] + np.arange(width)
+    return csr_array((values.ravel(), indices.ravel(), np.arange(0, n * width + 1, width)), shape=(n, columns))
 
 
 def factorise(normal: Array) -> Array:
@@ -67,7 +67,7 @@ def solve(factor: Array, right: Array) -> Array:
 def fit(first: NDArray[np.intp], values: Array, data: Array, columns: int) -> tuple[Array, Array]:
     """Least-squares solution (columns, k) of N X = data (n, k), and the factor of N'N for more."""
     factor = factorise(normal_matrix(first, values, columns))
-    return solve(factor, right_side(first, values, data, columns)), factor
+    return solve(factor, sparse_rows(first, values, columns).T @ data), factor
 
 
 def block_variances(factor: Array, blocks: int, columns: NDArray[np.intp]) -> Array:

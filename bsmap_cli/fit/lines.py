@@ -19,12 +19,13 @@ LEAST_SHARE = 0.5
 class ScanLines(NamedTuple):
     """Points of a data set, scan after scan in order of movement, beam after beam.
 
-    points : (n, 3) in map.  line : (n,) number of the scan line, 0 ... lines - 1, ascending.
+    points : (n, 3) in map.  line : (n,) number of the scan line, 0 ... lines - 1, ascending.  beam : (n,) ascending.
     covariances : (n, 6) in map, sensor part, packed.
     """
 
     points: Array
     line: IntArray
+    beam: IntArray
     covariances: Array
 
     @property
@@ -45,7 +46,9 @@ def gather_lines(cloud: PointCloud, movement: Movement, fewest: int) -> ScanLine
     ranges = [np.arange(start[k], stop[k]) for k in kept]
     index = np.concatenate([*ranges, np.zeros(0, dtype=np.int64)]).astype(np.int64)
     line = np.repeat(np.arange(len(kept)), counts[kept])
-    return ScanLines(cloud.points[index], line, _sensor_covariances(cloud, index))
+    return ScanLines(
+        cloud.points[index], line, cloud.beam_index[index].astype(np.int64), _sensor_covariances(cloud, index)
+    )
 
 
 def _sensor_covariances(cloud: PointCloud, index: IntArray) -> Array:

@@ -1,6 +1,5 @@
 """Surface of a data set: curves along its scan lines, then across them through their control points, Eq. (19-33)."""
 
-import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -8,8 +7,11 @@ import numpy as np
 from bsmap_cli.core import leastsquares
 from bsmap_cli.core.bspline import TensorSpline, design_matrix, evaluate_surface
 from bsmap_cli.errors import BsmapError
-from bsmap_cli.fit.curves import CurveFit, Rows, centripetal, refine_curves
+from bsmap_cli.fit.alignment import shared_centripetal
+from bsmap_cli.fit.curves import CurveFit, Rows, as_one_row, row_ends
 from bsmap_cli.fit.lines import ScanLines
+from bsmap_cli.fit.net import Net, columns_of, settled
+from bsmap_cli.fit.refinement import Refined, refine_curves
 from bsmap_cli.model import Array, Residuals
 from bsmap_cli.params import FitParams
 
@@ -40,7 +42,8 @@ def fit_scan_lines(lines: ScanLines, params: FitParams, u: Array | None = None) 
 
     Parameters
     ----------
-    u : (n,) parameters of the points, from 0 to 1 in each line; by default centripetal ones.
+    u : (n,) parameters of the points, from 0 to 1 in each line, that stay as they are; by default those that the
+        beams share, aligned with the curves.
 
     Raises
     ------
@@ -50,29 +53,27 @@ def fit_scan_lines(lines: ScanLines, params: FitParams, u: Array | None = None) 
     if lines.n_lines < 2:
         raise BsmapError(f"a surface needs 2 scan lines, here is {lines.n_lines}")
     degree_u, degree_v = params.degree_u, min(params.degree_v, lines.n_lines - 1)
-    u = centripetal(lines.points, lines.line) if u is None else u
-    rows = Rows(u, lines.line, lines.points[:, None], _allowance(lines.covariances, params)[:, None])
-    along = refine_curves(rows, degree_u, params.bound_u, params.knots_per_pass)
-    line_blocks, correlation_u = _propagate_along(lines, u, along, degree_u)
-    columns = along.control_points[:, :, 0]  # (lines, nu, 3)
-    v = mean_centripetal(columns)
-    row = Rows(v, np.zeros(lines.n_lines, dtype=np.int64), columns, _allowance(line_blocks, params))
-    across = refine_curves(row, degree_v, params.bound_v, params.knots_per_pass)
-    control_points = np.swapaxes(across.control_points[0], 0, 1)
-    spline = TensorSpline(degree_u, degree_v, along.knots, across.knots, control_points)
+    net = settled(_fit_net(lines, params, degree_v, u), params.bound_u, params.bound_v)
+    spline, across, v = net.spline, net.across.fit, net.across.rows.u
+    u = np.resize(net.along.rows.u, len(lines.points))
+    line_blocks, correlation_u = _propagate_along(lines, net.along, degree_u)
     distances = np.linalg.norm(evaluate_surface(spline, u, v[lines.line]) - lines.points, axis=1)
     blocks, correlation_v = _propagate_across(line_blocks, v, across, degree_v)
-    return SurfaceFit(
-        spline,
-        blocks,
-        correlation_u,
-        correlation_v,
-        u,
-        v,
-        residuals_of(distances),
-        _excess(rows, along),
-        _excess(row, across),
-    )
+    error_u, error_v = (max(0.0, float(found.excess.max())) for found in (net.along, net.across))
+    return SurfaceFit(spline, blocks, correlation_u, correlation_v, u, v, residuals_of(distances), error_u, error_v)
+
+
+def _fit_net(lines: ScanLines, params: FitParams, degree_v: int, u: Array | None) -> Net:
+    place = lines.beam if u is None else None
+    if u is None:
+        u = shared_centripetal(lines.points, lines.line, lines.beam)
+    rows = Rows(u, lines.line, lines.points[:, None], _allowance(lines.covariances, params)[:, None], place)
+    along = refine_curves(as_one_row(rows), params.degree_u, params.bound_u, params.knots_per_pass)
+    blocks = _propagate_along(lines, along, params.degree_u)[0]
+    columns, order = columns_of(along.fit), np.arange(lines.n_lines)
+    row = Rows(mean_centripetal(columns), np.zeros_like(order), columns, _allowance(blocks, params), order)
+    across = refine_curves(row, degree_v, params.bound_v, params.knots_per_pass)
+    return Net(along, across, params.degree_u, degree_v)
 
 
 def _allowance(covariances: Array, params: FitParams) -> Array:
@@ -95,25 +96,23 @@ def mean_centripetal(columns: Array) -> Array:
     return v
 
 
-def _excess(rows: Rows, fit: CurveFit) -> float:
-    return max(0.0, float((fit.errors - rows.allowance).max()))
-
-
-def _propagate_along(lines: ScanLines, u: Array, along: CurveFit, degree: int) -> tuple[Array, Array]:
+def _propagate_along(lines: ScanLines, along: Refined, degree: int) -> tuple[Array, Array]:
     """C_P = A C_Q A' along the scan lines, Eq. (32): blocks (lines, nu, 6), mean correlation (nu, nu).
 
     A = (N'N)^-1 N'; under equal noise A A' = (N'N)^-1, which gives the correlation.
     """
-    n_control = along.control_points.shape[1]
+    knots, factor, rows = along.fit.knots, along.fit.factor, along.rows
+    n_control = len(knots) - degree - 1
     blocks = np.empty((lines.n_lines, n_control, 6))
-    correlation = np.zeros((n_control, n_control))
+    correlation = np.zeros((rows.n_rows, n_control, n_control))
     starts = np.searchsorted(lines.line, np.arange(lines.n_lines + 1))
-    for k, (start, stop) in enumerate(itertools.pairwise(starts)):
-        N = design_matrix(along.knots, degree, u[start:stop])
-        factor = along.factor[:, k * n_control : (k + 1) * n_control]
-        blocks[k] = leastsquares.solve(factor, N.T) ** 2 @ lines.covariances[start:stop]
-        correlation += _correlation(leastsquares.solve(factor, np.eye(n_control)))
-    return blocks, correlation / lines.n_lines
+    for k, (first, last) in enumerate(zip(*row_ends(rows.row), strict=True)):
+        of_row = factor[:, k * n_control : (k + 1) * n_control]
+        A = leastsquares.solve(of_row, design_matrix(knots, degree, rows.u[first : last + 1]).T)
+        for line in range(lines.n_lines) if rows.n_rows == 1 else (k,):
+            blocks[line] = A**2 @ lines.covariances[starts[line] : starts[line + 1]]
+        correlation[k] = _correlation(leastsquares.solve(of_row, np.eye(n_control)))
+    return blocks, correlation.mean(axis=0)
 
 
 def _propagate_across(blocks: Array, v: Array, across: CurveFit, degree: int) -> tuple[Array, Array]:

@@ -6,7 +6,8 @@ import numpy as np
 
 from bsmap_cli.core import leastsquares
 from bsmap_cli.core.bspline import TensorSpline, design_matrix, evaluate_grid
-from bsmap_cli.fit.curves import CurveFit, Rows, fit_curves, refine_curves
+from bsmap_cli.fit.curves import CurveFit, Rows, fit_curves
+from bsmap_cli.fit.refinement import refine_curves
 from bsmap_cli.fit.surface import residuals_of
 from bsmap_cli.merge.covariance import carry
 from bsmap_cli.merge.fusion import Fused, Pairing
@@ -43,7 +44,7 @@ def _fit(parameters: Array, data: Array, knots: Array, degree: int, bound: float
     The patch's own knots are taken where the bound asks for as many: on them all that was not moved comes back exactly.
     """
     rows = Rows(parameters, np.zeros(len(data), dtype=np.int64), data, np.zeros(data.shape[:2]))
-    fit = refine_curves(rows, degree, bound, KNOTS_PER_PASS)
+    fit = refine_curves(rows, degree, bound, KNOTS_PER_PASS).fit
     return fit if len(fit.knots) < len(knots) else fit_curves(rows, knots, degree)
 
 

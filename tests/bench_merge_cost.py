@@ -16,7 +16,7 @@ from bsmap_cli.cloud import make_cloud
 from bsmap_cli.core.gaussian import symmetric_sqrt
 from bsmap_cli.fit import fit_surfaces
 from bsmap_cli.merge import merge_surfaces
-from bsmap_cli.merge.planar import is_planar
+from bsmap_cli.merge.bases import has_base
 from bsmap_cli.params import CloudParams, FitParams, MergeParams
 
 POSE = np.diag([1e-3**2, 1e-3**2, 1e-4**2])
@@ -28,7 +28,7 @@ def drawn(surface, rng):
     covariance = surface.covariance
     pose = tuple(replace(part, covariance=POSE) for part in covariance.pose)
     points = surface.control_points
-    if is_planar(surface):
+    if has_base(surface):
         heights = symmetric_sqrt(covariance.matrix) @ rng.standard_normal(len(covariance.matrix))
         points = points + heights.reshape(points.shape[:2])[..., None] * covariance.directions
     return replace(surface, control_points=points, covariance=replace(covariance, pose=pose))

@@ -25,7 +25,7 @@ from bsmap_cli.evaluate import distance_to_mesh, surface_samples, transform_poin
 from bsmap_cli.fit import fit_surfaces
 from bsmap_cli.io.surfaces_json import read_surfaces, write_surfaces
 from bsmap_cli.merge import merge_surfaces
-from bsmap_cli.merge.planar import is_planar, planar_face
+from bsmap_cli.merge.bases import based_face, has_base, normals
 from bsmap_cli.params import CloudParams, FitParams, MergeParams, SlamParams
 from bsmap_cli.slam import run_slam
 
@@ -48,14 +48,15 @@ def laid_over(samples, simulation, pose):
 
 
 def calibration(surface_map, simulation, pose):
-    """Errors and variances, sensor and pose part, of samples on all planar faces."""
+    """Errors and variances, sensor and pose part, of samples on all faces over a base."""
     errors, sensor, poses = [], [], []
     for surface in surface_map.surfaces:
-        face = planar_face(surface) if is_planar(surface) else None
+        face = based_face(surface) if has_base(surface) else None
         if face is not None:
             points = face.samples[face.areas > 0]
             d = distance_to_mesh(transform_points(pose, points), simulation.vertices, simulation.triangles)
-            own = np.einsum("i,nij,j->n", face.normal, pose_covariance(surface.covariance.pose, points), face.normal)
+            n = normals(face.field.base, points)
+            own = np.einsum("ni,nij,nj->n", n, pose_covariance(surface.covariance.pose, points), n)
             near = d < 0.03
             errors.append(d[near])
             sensor.append(face.variances[face.areas > 0][near])

@@ -18,7 +18,7 @@ from bsmap_cli.export.tessellation import tessellate
 from bsmap_cli.fit import fit_surfaces
 from bsmap_cli.io.surfaces_json import read_surfaces, write_surfaces
 from bsmap_cli.merge import merge_surfaces
-from bsmap_cli.merge.planar import planar_face
+from bsmap_cli.merge.bases import based_face
 from bsmap_cli.merge.regions import region_of, united
 from bsmap_cli.model import SurfaceMap
 from bsmap_cli.params import CloudParams, FitParams, MergeParams, SlamParams
@@ -30,7 +30,7 @@ def merged(*surfaces, **params):
 
 
 def area(surface):
-    return planar_face(surface).area
+    return based_face(surface).area
 
 
 def covers(surface, x, z):

@@ -15,8 +15,8 @@ from bsmap_cli.core.uncertainty import sensor_covariance
 from bsmap_cli.export.tessellation import tessellate_map
 from bsmap_cli.fit import fit_surfaces
 from bsmap_cli.merge import merge_surfaces
+from bsmap_cli.merge.bases import field_of
 from bsmap_cli.merge.extent import extended
-from bsmap_cli.merge.planar import field_of
 from bsmap_cli.model import BSplineSurface, Crease, SurfaceMap, TrimLoop
 from bsmap_cli.params import FitParams, MergeParams
 

@@ -14,18 +14,22 @@ ARC_ERROR = 2e-4
 
 
 def spline_of(fitted: Fitted, pose: tuple[PosePart, ...]) -> tuple[TensorSpline, HeightCovariance]:
-    """Surface in map with its covariance.
+    """Surface in map with its covariance."""
+    return spline_over(fitted.field, _inverse(fitted.information), pose)
+
+
+def spline_over(field: HeightField, matrix: Array, pose: tuple[PosePart, ...]) -> tuple[TensorSpline, HeightCovariance]:
+    """Surface in map of a height field whose heights have the covariance `matrix` (k, k).
 
     A height field over a plane is a B-spline surface as it stands. One over a cylinder is approximated by a spline that
     is cubic around the axis.
     """
-    field = fitted.field
     if isinstance(field.base, PlaneBase):
         k = field.knots
         points = field.base.place(_net(field, field.heights))
-        covariance = HeightCovariance(field.base.axes[None, None, :, 2], _inverse(fitted.information), pose)
+        covariance = HeightCovariance(field.base.axes[None, None, :, 2], matrix, pose)
         return TensorSpline(k.degree_s, k.degree_t, k.s, k.t, points), covariance
-    return _over_cylinder(fitted, field.base, pose)
+    return _over_cylinder(field, field.base, matrix, pose)
 
 
 def _net(field: HeightField, heights: Array) -> Array:
@@ -47,13 +51,12 @@ def _inverse(information: Array) -> Array:
 
 
 def _over_cylinder(
-    fitted: Fitted, base: CylinderBase, pose: tuple[PosePart, ...]
+    field: HeightField, base: CylinderBase, matrix: Array, pose: tuple[PosePart, ...]
 ) -> tuple[TensorSpline, HeightCovariance]:
     """Cubic around, by least squares through the height field, and exact upwards.
 
     The control points depend linearly on the heights: what they move outwards gives the covariance.
     """
-    field = fitted.field
     knots = _cubic_around(field, base)
     u = np.linspace(0.0, 1.0, 20 * knots.shape[0])
     around = design_matrix(field.knots.s, field.knots.degree_s, u)
@@ -66,7 +69,7 @@ def _over_cylinder(
     outwards, directions = (_outwards(field, base, at) for at in (u, greville(knots.s, knots.degree_s)))
     by_heights = (solve * (directions @ outwards.T)) @ around
     M = np.kron(by_heights, np.eye(knots.shape[1]))
-    covariance = HeightCovariance(directions[:, None], M @ _inverse(fitted.information) @ M.T, pose)
+    covariance = HeightCovariance(directions[:, None], M @ matrix @ M.T, pose)
     return TensorSpline(knots.degree_s, knots.degree_t, knots.s, knots.t, points), covariance
 
 

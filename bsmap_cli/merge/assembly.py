@@ -5,18 +5,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bsmap_cli.core.bspline import TensorSpline
-from bsmap_cli.fit.heights import HeightField
-from bsmap_cli.fit.selection import Fitted
-from bsmap_cli.fit.surfaces import spline_of
+from bsmap_cli.fit.heights import HeightField, PlaneBase
+from bsmap_cli.fit.surfaces import spline_over
+from bsmap_cli.merge.bases import BasedFace
 from bsmap_cli.merge.curves import FacePair
 from bsmap_cli.merge.extent import trimmed
-from bsmap_cli.merge.information import Frame, Joined, Told, covariance_of
+from bsmap_cli.merge.frames import Frame
+from bsmap_cli.merge.information import Joined, Told, covariance_of
 from bsmap_cli.merge.outlines import creased_sides, member_of, outline, snapped
-from bsmap_cli.merge.planar import PlanarFace
 from bsmap_cli.merge.shapes import Shape, spline_shape
 from bsmap_cli.merge.topology import Topology, find_topology
-from bsmap_cli.model import Array, BSplineSurface, Crease, HeightCovariance, Residuals
+from bsmap_cli.model import Array, BSplineSurface, Crease, Residuals
 
 JOINED = "face-"
 """Names of joined faces begin with it."""
@@ -25,7 +24,7 @@ JOINED = "face-"
 class Group(NamedTuple):
     """Faces of data sets that are one: what they tell, and what they give together. None for a face on its own."""
 
-    faces: list[PlanarFace]
+    faces: list[BasedFace]
     frame: Frame | None
     told: list[Told]
     joined: Joined | None
@@ -42,12 +41,14 @@ def assemble(
 
     Parameters
     ----------
-    others : surfaces over other bases than planes, each a face of the map by itself.
+    others : surfaces over other bases than planes and cylinders, each a face of the map by itself.
     creases : of the data sets.
     gap : metres between parts of a face, or between creases and corners, that are closed.
     """
-    shapes: dict[int, Shape] = {number: group.field for number, group in enumerate(groups)}
-    shapes |= {len(groups) + k: spline_shape(surface) for k, surface in enumerate(others)}
+    names = _names(groups, others)
+    whole = [_surface(group, names[k]) for k, group in enumerate(groups)] + list(others)
+    flat = [isinstance(group.field.base, PlaneBase) for group in groups] + [False] * len(others)
+    shapes: dict[int, Shape] = {k: groups[k].field if flat[k] else spline_shape(s) for k, s in enumerate(whole)}
     number_of = {face.surface.name: number for number, group in enumerate(groups) for face in group.faces}
     number_of |= {surface.name: len(groups) + k for k, surface in enumerate(others)}
     surfaces = [[face.surface for face in group.faces] for group in groups] + [[surface] for surface in others]
@@ -61,8 +62,6 @@ def assemble(
     outlines |= {number: members[number][0].corners for number in range(len(groups), len(surfaces))}
     sides = creased_sides(member for some in members for member in some)
     found = find_topology(outlines, sides, shapes, gap)
-    names = _names(groups, others)
-    whole = {k: _surface(groups[k], names[k]) if k < len(groups) else others[k - len(groups)] for k in found.rings}
     made = [trimmed(whole[number], rings, shapes[number]) for number, rings in found.rings.items()]
     return made, _creases(found, names), found.corners
 
@@ -102,8 +101,7 @@ def _names(groups: Sequence[Group], others: Sequence[BSplineSurface]) -> dict[in
 def _surface(group: Group, name: str) -> BSplineSurface:
     if group.joined is None:
         return group.faces[0].surface
-    spline: TensorSpline = spline_of(Fitted(group.joined.field, group.joined.information, 0.0), ())[0]
-    covariance: HeightCovariance = covariance_of(group.joined, group.told)
+    spline, covariance = spline_over(group.joined.field, *covariance_of(group.joined, group.told))
     data_sets = sorted({data_set for face in group.faces for data_set in face.surface.data_sets})
     residuals = _pooled([face.surface.residuals for face in group.faces])
     return BSplineSurface(name, tuple(data_sets), *spline, covariance, residuals)

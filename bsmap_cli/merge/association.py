@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 from scipy.stats import chi2
 
+from bsmap_cli.merge.bases import BasedFace
 from bsmap_cli.merge.comparison import Pair, compare, near, prepared
-from bsmap_cli.merge.planar import PlanarFace
 from bsmap_cli.model import Decision
 from bsmap_cli.params import MergeParams
 
@@ -35,7 +35,7 @@ class _Groups(NamedTuple):
 
 
 def associate(
-    faces: Sequence[PlanarFace], survey: Mapping[str, int], params: MergeParams
+    faces: Sequence[BasedFace], survey: Mapping[str, int], params: MergeParams
 ) -> tuple[list[list[int]], list[Decision]]:
     """Groups of faces, each one physical face, and decisions: of each joining, and of two groups why they stay apart.
 
@@ -60,7 +60,7 @@ def associate(
     return [sorted(found) for found in sorted(groups.members.values(), key=min)], decisions
 
 
-def _compared(faces: Sequence[PlanarFace], gate: float, params: MergeParams) -> list[Pair]:
+def _compared(faces: Sequence[BasedFace], gate: float, params: MergeParams) -> list[Pair]:
     """Pairs that met: each face, the largest first, against the few that overlap it most of each group so far."""
     groups, pairs = _alone(len(faces)), []
     order = sorted(range(len(faces)), key=lambda k: (-faces[k].area, k))
@@ -96,7 +96,7 @@ def _keep_apart(groups: _Groups, pairs: Sequence[Pair], gate: float, params: Mer
             groups.apart[pair.first][pair.second] = groups.apart[pair.second][pair.first] = pair
 
 
-def _join(groups: _Groups, pair: Pair, faces: Sequence[PlanarFace]) -> str | None:
+def _join(groups: _Groups, pair: Pair, faces: Sequence[BasedFace]) -> str | None:
     """Put the groups of a pair together; the reason where they hold faces that are to stay apart."""
     a, b = groups.of[pair.first], groups.of[pair.second]
     if a == b:
@@ -114,7 +114,7 @@ def _join(groups: _Groups, pair: Pair, faces: Sequence[PlanarFace]) -> str | Non
 
 
 def _with_moved(
-    faces: Sequence[PlanarFace],
+    faces: Sequence[BasedFace],
     refused: Sequence[tuple[Pair, str]],
     group: Sequence[int],
     survey: Mapping[str, int],
@@ -137,7 +137,7 @@ def _with_moved(
     return [*moved, *others]
 
 
-def _refusals(faces: Sequence[PlanarFace], refused: Sequence[tuple[Pair, str]], group: Sequence[int]) -> list[Decision]:
+def _refusals(faces: Sequence[BasedFace], refused: Sequence[tuple[Pair, str]], group: Sequence[int]) -> list[Decision]:
     """Of each two groups (or within one) the refusal of the strongest pair, and of how many pairs it speaks."""
     between: dict[tuple[int, int], list[tuple[Pair, str]]] = defaultdict(list)
     for pair, reason in refused:
@@ -160,7 +160,7 @@ def _refusal(pair: Pair, gate: float, params: MergeParams) -> str | None:
     return "they are of one data set" if pair.same else None
 
 
-def _decision(faces: Sequence[PlanarFace], pair: Pair, reason: str | None) -> Decision:
+def _decision(faces: Sequence[BasedFace], pair: Pair, reason: str | None) -> Decision:
     figures = {"area": pair.area, "offset": pair.offset, "squared_mahalanobis": pair.distance}
     names = faces[pair.first].surface.name, faces[pair.second].surface.name
     rounded = {key: float(f"{value:.4g}") for key, value in figures.items()}

@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 
 from bsmap_cli.fit.heights import evaluate
-from bsmap_cli.merge.planar import PlanarFace, height_variances, pose_variances
+from bsmap_cli.merge.bases import BasedFace, height_variances, normals, pose_variances
 from bsmap_cli.merge.regions import Region
 from bsmap_cli.model import Array
 from bsmap_cli.params import MergeParams
@@ -35,12 +35,12 @@ class Pair(NamedTuple):
 class Comparison(NamedTuple):
     """Faces to be compared.  reach : of each the region and what lies beside it within the gap."""
 
-    faces: Sequence[PlanarFace]
+    faces: Sequence[BasedFace]
     reach: Sequence[Region]
     params: MergeParams
 
 
-def prepared(faces: Sequence[PlanarFace], params: MergeParams) -> Comparison:
+def prepared(faces: Sequence[BasedFace], params: MergeParams) -> Comparison:
     """Faces ready to be compared many times."""
     regions = [face.region for face in faces]
     reach = list(shapely.buffer(regions, params.gap, quad_segs=2)) if regions else []
@@ -49,7 +49,7 @@ def prepared(faces: Sequence[PlanarFace], params: MergeParams) -> Comparison:
     return Comparison(faces, reach, params)
 
 
-def near(faces: Sequence[PlanarFace], params: MergeParams) -> list[list[tuple[int, float]]]:
+def near(faces: Sequence[BasedFace], params: MergeParams) -> list[list[tuple[int, float]]]:
     """Of each face those whose boxes are near and whose planes are about parallel: numbers, and about square metres
     that the boxes share.
     """
@@ -58,20 +58,27 @@ def near(faces: Sequence[PlanarFace], params: MergeParams) -> list[list[tuple[in
         return out
     low = np.array([face.samples.min(axis=0) for face in faces])
     high = np.array([face.samples.max(axis=0) for face in faces])
-    normals = np.array([face.normal for face in faces])
+    ways = np.array([normals(face.field.base, face.samples[:1])[0] for face in faces])
+    bent = np.array([face.round for face in faces])
     reach = max(params.distance, params.gap)
     boxes = shapely.box(low[:, 0], low[:, 1], high[:, 0], high[:, 1])
     wide = shapely.box(low[:, 0] - reach, low[:, 1] - reach, high[:, 0] + reach, high[:, 1] + reach)
     a, b = shapely.STRtree(boxes).query(wide)
     level = (low[a, 2] - reach <= high[b, 2]) & (low[b, 2] - reach <= high[a, 2])
-    parallel = np.abs(np.sum(normals[a] * normals[b], axis=1)) > np.cos(LARGEST_ANGLE)
-    kept = (a != b) & level & parallel
+    parallel = np.abs(np.sum(ways[a] * ways[b], axis=1)) > np.cos(LARGEST_ANGLE)
+    kept = (a != b) & level & (bent[a] == bent[b]) & (bent[a] | parallel)
     a, b = a[kept], b[kept]
     shared = np.maximum(np.minimum(high[a], high[b]) - np.maximum(low[a], low[b]), 0.0)
     overlap = np.prod(np.sort(shared, axis=1)[:, 1:], axis=1)
     for one, other, area in zip(a.tolist(), b.tolist(), overlap.tolist(), strict=True):
         out[one].append((other, area))
     return out
+
+
+def _turned(one: BasedFace, other: BasedFace) -> float:
+    """+1 where the bases' normals point the same way at the middle of a face, -1 where they are turned round."""
+    at = one.samples[:1] if one.round else one.samples.mean(axis=0)[None]
+    return float(np.sign(np.sum(normals(one.field.base, at) * normals(other.field.base, at))))
 
 
 class _Offsets(NamedTuple):
@@ -95,7 +102,7 @@ def compare(comparison: Comparison, a: int, b: int) -> Pair | None:
     offset = float(np.sqrt(np.mean(h[used] ** 2)))
     distance = float(np.mean(h[used] ** 2 / variance[used]))
     same = bool(set(one.surface.data_sets) & set(other.surface.data_sets))
-    looks = one.facing * other.facing * np.sign(one.normal @ other.normal)
+    looks = one.facing * other.facing * _turned(one, other)
     area = float(areas[inside > 0.0].sum() / 2.0)
     return Pair(a, b, area, offset, distance, same, bool(looks < 0.0))
 

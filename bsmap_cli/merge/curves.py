@@ -28,6 +28,7 @@ class Curve(NamedTuple):
 
     points : (n, 3) of a polyline in map.  t : (n,) its length up to them, metres.  seen : (k, 2) ascending intervals of
     t in which creases of data sets ran.  beside : metres from it within which an outline runs along it.
+    reach : metres by which it goes on straight beyond its ends.
     """
 
     pair: FacePair
@@ -35,6 +36,7 @@ class Curve(NamedTuple):
     t: Array
     seen: Array
     beside: float = BESIDE
+    reach: float = np.inf
 
 
 def onto(shapes: Sequence[Shape], points: Array, farthest: float = FARTHEST) -> Array:
@@ -74,13 +76,13 @@ def touched(intervals: Array, low: float, high: float, gap: float) -> bool:
 def locate(curve: Curve, points: Array) -> tuple[Array, Array]:
     """Length t (n,) along the curve of the nearest places to points (n, 3), and the distances (n,).
 
-    Beyond its ends the curve goes on straight.
+    Beyond its ends the curve goes on straight, as far as it reaches.
     """
     starts, ways = curve.points[:-1], np.diff(curve.points, axis=0)
     lengths = np.linalg.norm(ways, axis=1)
     along = np.einsum("nkd,kd->nk", points[:, None] - starts, ways / lengths[:, None])
     low, high = np.zeros(len(ways)), lengths.copy()
-    low[0], high[-1] = -np.inf, np.inf
+    low[0], high[-1] = -curve.reach, lengths[-1] + curve.reach
     along = np.clip(along, low, high)
     nearest = starts + along[..., None] * (ways / lengths[:, None])
     distance = np.linalg.norm(points[:, None] - nearest, axis=2)

@@ -5,11 +5,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bsmap_cli.fit.heights import PlaneBase
 from bsmap_cli.merge.adjustment import Correction, adjust, moved, moved_crease, with_left_over
 from bsmap_cli.merge.assembly import Group, assemble
 from bsmap_cli.merge.association import associate
-from bsmap_cli.merge.information import common_frame, join, tell
-from bsmap_cli.merge.planar import PlanarFace, is_planar, planar_face
+from bsmap_cli.merge.bases import BasedFace, based_face, has_base
+from bsmap_cli.merge.frames import common_frame
+from bsmap_cli.merge.information import join, tell
 from bsmap_cli.model import Array, BSplineSurface, Crease, Decision
 from bsmap_cli.params import MergeParams
 from bsmap_cli.track import Track, silent
@@ -38,7 +40,7 @@ def merge_faces(
     *,
     track: Track = silent,
 ) -> MergedFaces:
-    """Join faces over planes that are one, trim them by what any data set saw, and join their creases.
+    """Join faces that are one, over planes or cylinders, trim them by what any data set saw, and join their creases.
 
     Twice: the faces that are joined first tell small corrections of the data sets' poses; with these taken away all
     are associated and joined again. Faces over other bases stay as they are, which a decision says.
@@ -49,21 +51,22 @@ def merge_faces(
     survey : number of the survey that each surface stems from, by name.
     """
     surfaces = sorted(surfaces, key=_key)
-    faces = [face for s in surfaces if is_planar(s) and (face := planar_face(s)) is not None]
+    faces = [face for s in surfaces if has_base(s) and (face := based_face(s)) is not None]
     track("merging faces", 0, 2)
     groups = _groups(faces, associate(faces, survey, params)[0], params)
-    corrections = adjust([(group.told, group.joined) for group in groups if group.joined])
+    # Pillars bear what the path errs by within a data set more than they tell of its pose (1 cm off in a corridor).
+    corrections = adjust([(g.told, g.joined) for g in groups if g.joined and isinstance(g.field.base, PlaneBase)])
     track("merging faces", 1, 2)
     if corrections:
         by_name = {surface.name: surface for surface in surfaces}
         creases = [moved_crease(crease, by_name, corrections) for crease in creases]
         surfaces = [moved(surface, corrections) for surface in surfaces]
-        faces = [face for s in surfaces if is_planar(s) and (face := planar_face(s)) is not None]
+        faces = [face for s in surfaces if has_base(s) and (face := based_face(s)) is not None]
     gated = [face._replace(surface=with_left_over(face.surface, corrections)) for face in faces]
     numbers, decisions = associate(gated, survey, params)
     groups = _groups(faces, numbers, params)
-    planar = {face.surface.name for face in faces}
-    others = [surface for surface in surfaces if surface.name not in planar]
+    based = {face.surface.name for face in faces}
+    others = [surface for surface in surfaces if surface.name not in based]
     track("merging faces", 2, 2)
     made, lines, corners = assemble(groups, others, creases, params.gap)
     notes = {
@@ -86,11 +89,11 @@ def _largest(corrections: dict[str, Correction]) -> float:
 def _left(others: Sequence[BSplineSurface]) -> list[Decision]:
     if not others:
         return []
-    reason = "faces that are not over a plane stay as they are: joining them is not possible yet"
+    reason = "faces over neither a plane nor a cylinder stay as they are: joining them is not possible yet"
     return [Decision("", "", "refused", reason, {"faces": float(len(others))})]
 
 
-def _groups(faces: Sequence[PlanarFace], numbers: Sequence[Sequence[int]], params: MergeParams) -> list[Group]:
+def _groups(faces: Sequence[BasedFace], numbers: Sequence[Sequence[int]], params: MergeParams) -> list[Group]:
     out = []
     for members in numbers:
         some = [faces[number] for number in members]

@@ -1,4 +1,4 @@
-"""Faces over planes joined over one base in information form: heights, their knots and covariance, shares of poses.
+"""Faces joined over one plane or cylinder in information form: heights, their knots and covariance, shares of poses.
 
 A data set A tells its control heights c_A with the sensor part C_A of their covariance. With P_A from the heights c of
 the joined face to those of A the sum of
@@ -28,15 +28,14 @@ from bsmap_cli.fit.heights import (
     Knots,
     PlaneBase,
     basis_matrix,
-    evaluate,
-    flat_knots,
     greville,
-    plane_base,
+    least_knots,
     with_degree,
     with_knot,
 )
 from bsmap_cli.fit.selection import HIGHEST_DEGREE, MOST, PRICE, smoothness
-from bsmap_cli.merge.planar import PlanarFace
+from bsmap_cli.merge.bases import BasedFace, height_basis, normals, places_on
+from bsmap_cli.merge.frames import Frame
 from bsmap_cli.model import Array, HeightCovariance, PosePart
 
 WAVE = 1.0
@@ -49,20 +48,14 @@ ROBUST = 3.0
 
 LEAST_SIGMA, ROUNDED = 1e-5, 1e-6
 """Metres, and share of a variance, to which sensor parts are known at best: files round coordinates and covariances."""
+LEAST_SHARE = 1e-6
+"""Of the largest variance of heights over a cylinder: what has less was not fitted."""
 ALIGNED = 0.95
 """Cosine between axes that count as the same."""
 LEAST_SPAN = 0.01
 """Between knots, of the whole."""
 ENOUGH = 2.0
 """Criterion for each height told, above which other knots are tried."""
-
-
-class Frame(NamedTuple):
-    """Common base of a group, and the rectangle from `low` (2,) to `high` (2,) that it fills, metres."""
-
-    base: PlaneBase
-    low: Array
-    high: Array
 
 
 class Told(NamedTuple):
@@ -103,44 +96,42 @@ class Joined(NamedTuple):
     criterion: float
 
 
-def common_frame(faces: Sequence[PlanarFace]) -> Frame:
-    """Plane through all faces, its normal towards the sensors, and the rectangle around the faces' own."""
-    points = np.concatenate([face.samples[face.areas > 0.0] for face in faces])
-    weights = np.concatenate([face.areas[face.areas > 0.0] for face in faces])
-    centred = points - np.average(points, axis=0, weights=weights)
-    normal = np.linalg.eigh(centred.T @ (weights[:, None] * centred))[1][:, 0]
-    votes = sum(face.area * face.facing * np.sign(face.normal @ normal) for face in faces)
-    first = normal[np.argmax(np.abs(normal))]
-    normal = normal * (np.sign(votes) if votes != 0.0 else np.sign(first))
-    base = plane_base(points, normal)
-    corners = np.concatenate([base.local(_places(face.field, np.array([0.0, 1.0])))[:, :2] for face in faces])
-    return Frame(base, corners.min(axis=0), corners.max(axis=0))
-
-
-def tell(face: PlanarFace, frame: Frame, flatness: float) -> Told:
+def tell(face: BasedFace, frame: Frame, flatness: float) -> Told:
     """Carry a face's heights and their covariance over to the common base, by least squares on samples."""
     field, covariance = face.field, face.surface.covariance
     assert isinstance(covariance, HeightCovariance)
     grid = _grid(field.knots)
-    places = field.base.place(np.column_stack([grid * (field.high - field.low), evaluate(field, grid)[0]]))
+    places = places_on(field, grid)
     local = frame.base.local(places)
-    basis = basis_matrix(field.knots, grid)
+    n = normals(frame.base, places)
+    free, C = _free_heights(covariance.matrix) if face.round else (np.eye(len(covariance.matrix)), covariance.matrix)
+    basis = height_basis(face.surface, field, grid) @ free
     carry = np.asarray(np.linalg.pinv(basis), dtype=np.float64)
-    n = frame.base.axes[:, 2]
     by_pose = [carry @ _lifted(part, places, n) for part in covariance.pose]
-    k = field.knots
-    s, t = greville(k.s, k.degree_s), greville(k.t, k.degree_t)
-    at = np.stack(np.meshgrid(s, t, indexing="ij"), axis=-1).reshape(-1, 2) * (field.high - field.low)
-    uneven = flatness**2 * np.exp(-cdist(at, at) / WAVE)
-    C, pose = covariance.matrix, covariance.pose
+    uneven = free.T @ (flatness**2 * np.exp(-_distances(field) / WAVE)) @ free
     known = C + np.diag(LEAST_SIGMA**2 + ROUNDED * np.diag(C))
     root, sensor_root = _inverse_root(C + uneven), _inverse_root(known)
     uv = (local[:, :2] - frame.low) / (frame.high - frame.low)
-    lifts = np.concatenate(by_pose, axis=1) if by_pose else np.zeros((len(at), 0))
+    all_poses = np.concatenate(by_pose, axis=1) if by_pose else np.zeros((len(C), 0))
     degrees, inner = _knots_in(field, frame)
     stiffness = float(np.sqrt(basis.shape[1] / basis.shape[0])) / flatness
     heights = carry @ local[:, 2]
-    return Told(uv, carry, heights, root, sensor_root, C, lifts, pose, basis, stiffness, degrees, inner)
+    return Told(uv, carry, heights, root, sensor_root, C, all_poses, covariance.pose, basis, stiffness, degrees, inner)
+
+
+def _free_heights(covariance: Array) -> tuple[Array, Array]:
+    """Heights (n, k) that the data could move, and their covariance (k, k): splines that follow an arc have more."""
+    values, vectors = np.linalg.eigh(covariance)
+    free = values > LEAST_SHARE * values[-1]
+    return vectors[:, free], np.diag(values[free])
+
+
+def _distances(field: HeightField) -> Array:
+    """(n, n) metres between the control points of a field."""
+    k = field.knots
+    s, t = greville(k.s, k.degree_s), greville(k.t, k.degree_t)
+    at = np.stack(np.meshgrid(s, t, indexing="ij"), axis=-1).reshape(-1, 2) * (field.high - field.low)
+    return np.asarray(cdist(at, at))
 
 
 def _inverse_root(covariance: Array) -> Array:
@@ -149,29 +140,29 @@ def _inverse_root(covariance: Array) -> Array:
 
 
 def _knots_in(field: HeightField, frame: Frame) -> tuple[tuple[int, int], tuple[Array, Array]]:
-    """Degrees and knots of a face along the frame's axes; none where its own are skew to them."""
+    """Degrees and knots of a face along the frame's axes; none where its own are skew to them, or follow an arc."""
     k = field.knots
-    if k.size == 4:
-        return (1, 1), (np.zeros(0), np.zeros(0))
-    turn = frame.base.axes[:, 0] @ field.base.axes[:, :2]  # type: ignore[union-attr]
     degrees, inner = [1, 1], [np.zeros(0), np.zeros(0)]
-    for own, (degree, knots) in enumerate(((k.degree_s, k.s), (k.degree_t, k.t))):
-        axis = 0 if abs(turn[own]) > ALIGNED else 1
-        if axis == 1 and abs(turn[1 - own]) < ALIGNED:
-            continue
-        at = np.full((len(np.unique(knots)), 3), 0.0)
-        at[:, own] = np.unique(knots) * field.high[own]
-        local = frame.base.local(field.base.place(at))[:, :2]
-        along = ((local - frame.low) / (frame.high - frame.low))[:, axis]
-        degrees[axis], inner[axis] = degree, along if degree > 1 or len(along) > 2 else np.zeros(0)
+    if k.size > 4 and isinstance(frame.base, PlaneBase) and isinstance(field.base, PlaneBase):
+        turn = frame.base.axes[:, 0] @ field.base.axes[:, :2]
+        for own, (degree, knots) in enumerate(((k.degree_s, k.s), (k.degree_t, k.t))):
+            axis = 0 if abs(turn[own]) > ALIGNED else 1
+            if axis == 1 and abs(turn[1 - own]) < ALIGNED:
+                continue
+            at = np.full((len(np.unique(knots)), 3), 0.0)
+            at[:, own] = np.unique(knots) * field.high[own]
+            local = frame.base.local(field.base.place(at))[:, :2]
+            along = ((local - frame.low) / (frame.high - frame.low))[:, axis]
+            degrees[axis], inner[axis] = degree, along if degree > 1 or len(along) > 2 else np.zeros(0)
     return (degrees[0], degrees[1]), (inner[0], inner[1])
 
 
-def _lifted(part: PosePart, points: Array, normal: Array) -> Array:
-    """(m, 3 + modes) change of the heights of points (m, 3) by unit errors of a pose part, by its share."""
-    J = np.zeros((len(points), 3))
-    J[:, :2] = normal[:2]
-    J[:, 2] = normal[1] * (points[:, 0] - part.centre[0]) - normal[0] * (points[:, 1] - part.centre[1])
+def _lifted(part: PosePart, points: Array, normals: Array) -> Array:
+    """(m, 3 + modes) change of heights along normals (m, 3) at points (m, 3) by unit errors of a pose part, by its
+    share.
+    """
+    J = normals.copy()
+    J[:, 2] = normals[:, 1] * (points[:, 0] - part.centre[0]) - normals[:, 0] * (points[:, 1] - part.centre[1])
     return np.asarray(part.weight * J @ unit_errors(part))
 
 
@@ -186,7 +177,7 @@ def join(told: Sequence[Told], frame: Frame) -> Joined:
 
     Where that does not end in a good fit, it is tried from the knots of all faces told, too.
     """
-    best = _improved(told, frame, flat_knots())
+    best = _improved(told, frame, least_knots(frame.base))
     own = _own_knots(told)
     if own.size > 4 and best.criterion > ENOUGH * sum(len(one.heights) for one in told):
         best = min(best, _improved(told, frame, own), key=lambda j: j.criterion)
@@ -270,7 +261,7 @@ def _ends(told: Sequence[Told]) -> list[int]:
     return np.cumsum([len(one.uv) for one in told])[:-1].tolist()
 
 
-def covariance_of(joined: Joined, told: Sequence[Told]) -> HeightCovariance:
+def covariance_of(joined: Joined, told: Sequence[Told]) -> tuple[Array, tuple[PosePart, ...]]:
     """Sensor part sum K_A C_A K_A' of the heights, and the pose parts by their share in the whole.
 
     The shares are the mean over the face: trace(K_A P_A) over the number of heights. They add up to 1.
@@ -287,15 +278,9 @@ def covariance_of(joined: Joined, told: Sequence[Told]) -> HeightCovariance:
         for part in one.pose:
             before = parts[part.data_set].weight if part.data_set in parts else 0.0
             parts[part.data_set] = replace(part, weight=float(before + share * part.weight))
-    directions = np.asarray(joined.field.base.axes[None, None, :, 2])  # type: ignore[union-attr]
-    return HeightCovariance(directions, (matrix + matrix.T) / 2.0, tuple(parts[name] for name in sorted(parts)))
+    return (matrix + matrix.T) / 2.0, tuple(parts[name] for name in sorted(parts))
 
 
 def _grid(knots: Knots) -> Array:
     u, v = (np.linspace(0.0, 1.0, PER_CONTROL_POINT * n) for n in knots.shape)
     return np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2)
-
-
-def _places(field: HeightField, ends: Array) -> Array:
-    uv = np.stack(np.meshgrid(ends, ends, indexing="ij"), axis=-1).reshape(-1, 2)
-    return field.base.place(np.column_stack([field.low + uv * (field.high - field.low), evaluate(field, uv)[0]]))

@@ -9,7 +9,8 @@ import shapely
 
 from bsmap_cli.core.bspline import evaluate_surface
 from bsmap_cli.core.polygons import simplify
-from bsmap_cli.fit.heights import HeightField, evaluate
+from bsmap_cli.fit.heights import HeightField, PlaneBase
+from bsmap_cli.merge.bases import places_on
 from bsmap_cli.merge.curves import FacePair, Shapes, onto
 from bsmap_cli.merge.regions import Region, loops_of, region_of, united
 from bsmap_cli.model import Array, BSplineSurface
@@ -55,19 +56,29 @@ def outline(members: Sequence[Member], sets: Sequence[str], field: HeightField, 
 
     members : snapped.  sets : the data sets of each.
     """
-    flat = [[field.base.local(points)[:, :2] for points in member.corners] for member in members]
     by_set: dict[str, list[Region]] = defaultdict(list)
-    for name, loops in zip(sets, flat, strict=True):
-        by_set[name].append(region_of(loops))
+    for name, member in zip(sets, members, strict=True):
+        by_set[name].append(_region(member, field))
     creases = np.concatenate([np.zeros((0, 2, 3)), *creased_sides(members).values()])
     regions = [shapely.union_all(some) for _, some in sorted(by_set.items())]
     whole = united(regions, gap, field.base.local(creases)[..., :2])
-    loops = []
-    for ring in loops_of(whole, TOLERANCE):
-        st = _following(ring, field)
-        height = evaluate(field, (st - field.low) / (field.high - field.low))[0]
-        loops.append(field.base.place(np.column_stack([st, height])))
-    return loops
+    return [_following(ring, field) for ring in loops_of(whole, TOLERANCE)]
+
+
+def _region(member: Member, field: HeightField) -> Region:
+    """Region of a member in s and t of the field's base."""
+    loops = [field.base.local(points)[:, :2] for points in member.corners]
+    if isinstance(field.base, PlaneBase):
+        return region_of(loops)
+    # A loop that crosses the line where s begins again goes on beyond it, and is cut there afterwards.
+    turn = 2.0 * np.pi * field.base.radius
+    loops = [np.column_stack([np.unwrap(st[:, 0], period=turn), st[:, 1]]) for st in loops]
+    first = loops[0][:, 0].mean()
+    once = np.array([turn, 0.0])
+    region = region_of([st + once * np.round((first - st[:, 0].mean()) / turn) for st in loops])
+    window = shapely.box(field.low[0], region.bounds[1], field.high[0], region.bounds[3])
+    copies = [shapely.transform(region, lambda st, k=k: st + k * once) for k in (-1, 0, 1)]
+    return shapely.union_all(shapely.intersection(copies, window))
 
 
 def creased_sides(members: Iterable[Member]) -> dict[FacePair, Array]:
@@ -83,13 +94,17 @@ def creased_sides(members: Iterable[Member]) -> dict[FacePair, Array]:
 
 
 def _following(ring: Array, field: HeightField) -> Array:
-    """The ring with corners more where its sides, straight in the base, follow a curved surface."""
-    if field.knots.size == 4:
-        return ring
+    """(k, 3) the ring (n, 2) on the field, with corners more where its sides, straight in the base, follow a curve."""
+    if field.knots.size == 4 and isinstance(field.base, PlaneBase):
+        return _placed(ring, field)
     out = []
     for start, end in zip(ring, np.roll(ring, -1, axis=0), strict=True):
         share = np.linspace(0.0, 1.0, max(2, int(np.ceil(np.linalg.norm(end - start) / FINE)) + 1))
-        points = start + share[:, None] * (end - start)
-        height = evaluate(field, (points - field.low) / (field.high - field.low))[0]
-        out.append(points[simplify(np.column_stack([points, height]), TOLERANCE)][:-1])
+        points = _placed(start + share[:, None] * (end - start), field)
+        out.append(points[simplify(points, TOLERANCE)][:-1])
     return np.concatenate(out)
+
+
+def _placed(st: Array, field: HeightField) -> Array:
+    """(n, 3) points in map on a field at s and t (n, 2)."""
+    return places_on(field, (st - field.low) / (field.high - field.low))

@@ -70,7 +70,9 @@ def _curves_of_sides(loop: Array, curves: Mapping[int, Curve], gap: float) -> In
         t, off = np.stack([t, np.roll(t, -1)]), np.maximum(off, np.roll(off, -1))
         low, high = t.min(axis=0)[:, None], t.max(axis=0)[:, None]
         seen = np.any((curve.seen[:, 0] < high + gap) & (curve.seen[:, 1] > low - gap), axis=1)
-        along = (off < curve.beside) & (off < best) & (np.abs(t[1] - t[0]) > 0.5 * length) & seen
+        way = np.abs(t[1] - t[0])
+        # Around a pillar a side leads from the end of the curve to its beginning: it is far shorter than the way back.
+        along = (off < curve.beside) & (off < best) & (way > 0.5 * length) & (way < 2.0 * length) & seen
         best[along], number[along] = off[along], k
     return number
 

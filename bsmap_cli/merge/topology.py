@@ -104,8 +104,11 @@ def _find_loops(
 
 
 def _is_sliver(loop: Array, curves: Iterable[Curve]) -> bool:
-    """Whether a loop lies along a single curve as a whole: of two data sets' outlines there, a remnant."""
-    return any(locate(curve, loop)[1].max() < curve.beside for curve in curves)
+    """Whether a narrow loop lies along a single curve as a whole: of two data sets' outlines there, a remnant."""
+    following = np.roll(loop, -1, axis=0)
+    area = np.linalg.norm(np.cross(loop - loop[0], following - loop[0]).sum(axis=0)) / 2.0
+    length = np.linalg.norm(following - loop, axis=1).sum()
+    return any(area < length * curve.beside / 2.0 and locate(curve, loop)[1].max() < curve.beside for curve in curves)
 
 
 def _unseen_curves(

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from bsmap_cli.core.polygons import simplify
-from bsmap_cli.merge.curves import APART, Curve, FacePair, Shapes, locate, onto, place, union
+from bsmap_cli.merge.curves import APART, BESIDE, Curve, FacePair, Shapes, locate, onto, place, union
 from bsmap_cli.merge.shapes import Shape, SplineShape, above, parameters_of
 from bsmap_cli.model import Array
 
@@ -17,6 +17,8 @@ ON = 0.002
 """Metres off a surface within which a point of a curve is on it: where surfaces touch, they hardly cross."""
 STRAIGHT = 0.005
 """Metres by which the creases of a straight curve leave their line."""
+BENT_REACH = 0.1
+"""Metres by which a bent curve goes on straight beyond its ends: around a pillar both ends come near each other."""
 SKEW = 0.3
 """Least sine of the angle between two faces of which no data set saw the crease."""
 EVERYWHERE = np.array([[-np.inf, np.inf]])
@@ -43,7 +45,9 @@ def _traced(pair: FacePair, sides: Array, shapes: Shapes) -> Curve | None:
     if curve is None:
         return None
     at = np.sort(locate(curve, points)[0].reshape(-1, 2), axis=1)
-    return curve._replace(seen=union(at, APART))
+    _, direction = _main_line(curve.points)
+    straight = np.linalg.norm(np.cross(curve.points - curve.points[0], direction), axis=1).max() < BESIDE
+    return curve._replace(seen=union(at, APART), reach=np.inf if straight else BENT_REACH)
 
 
 def _around(shapes: Sequence[Shape], points: Array) -> Array:

@@ -15,6 +15,7 @@ from bsmap_cli.merge.information import Joined, Told, covariance_of
 from bsmap_cli.merge.outlines import creased_sides, member_of, outline, snapped
 from bsmap_cli.merge.shapes import Shape, spline_shape
 from bsmap_cli.merge.topology import Topology, find_topology
+from bsmap_cli.merge.untangling import untangled
 from bsmap_cli.model import Array, BSplineSurface, Crease, Residuals
 
 JOINED = "face-"
@@ -62,7 +63,8 @@ def assemble(
     outlines |= {number: members[number][0].corners for number in range(len(groups), len(surfaces))}
     sides = creased_sides(member for some in members for member in some)
     found = find_topology(outlines, sides, shapes, gap)
-    made = [trimmed(whole[number], rings, shapes[number]) for number, rings in found.rings.items()]
+    simple = {number: untangled(rings, shapes[number]) for number, rings in found.rings.items()}
+    made = [trimmed(whole[number], rings, shapes[number]) for number, rings in simple.items()]
     return made, _creases(found, names), found.corners
 
 

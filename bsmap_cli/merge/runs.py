@@ -54,7 +54,28 @@ def find_runs(loop: Array, curves: Mapping[int, Curve], gap: float) -> list[Run]
         if along[start] >= 0:
             t = locate(curves[int(along[start])], loop[[start, stop]])[0]
             runs.append(Run(int(along[start]), start, stop, float(t[0]), float(t[1])))
-    return _long(_joined(_long(runs), loop, curves, gap))
+    return _one_sided(_long(_joined(_long(runs), loop, curves, gap)), loop, curves)
+
+
+def _one_sided(runs: Sequence[Run], loop: Array, curves: Mapping[int, Curve]) -> list[Run]:
+    """The runs, of two that run along the same part of a curve there and back only the nearer one.
+
+    A face lies on one side of its crease: the other border of a narrow strip may be near, too.
+    """
+    off = [locate(curves[run.curve], open_part(loop, run.first, run.last))[1].mean() for run in runs]
+    kept: list[Run] = []
+    for k in sorted(range(len(runs)), key=lambda number: (off[number], number)):
+        run = runs[k]
+        against = (other for other in kept if run.curve == other.curve and run.sign != other.sign)
+        if all(_shared(run, other) <= APART for other in against):
+            kept.append(run)
+    return sorted(kept, key=lambda run: run.first)
+
+
+def _shared(one: Run, other: Run) -> float:
+    """Metres of a curve that two runs have in common."""
+    (a, b), (c, d) = sorted((one.start, one.end)), sorted((other.start, other.end))
+    return min(b, d) - max(a, c)
 
 
 def _long(runs: Sequence[Run]) -> list[Run]:

@@ -42,6 +42,19 @@ def parameters_of(shape: Shape, points: Array) -> Array:
     return _nearest(shape, points)[0]
 
 
+def flattened(shape: Shape, points: Array) -> Array:
+    """(n, 2) parameters of the nearest places to points (n, 3), in about metres."""
+    if isinstance(shape, HeightField):
+        return shape.base.local(points)[:, :2]
+    return parameters_of(shape, points) * lengths_of(shape)
+
+
+def lengths_of(shape: SplineShape) -> Array:
+    """(2,) metres about along u and along v."""
+    grid = shape.points.reshape(GRID, GRID, 3)
+    return np.array([np.linalg.norm(np.diff(grid, axis=axis), axis=2).sum(axis=axis).max() for axis in (0, 1)])
+
+
 def above(shape: Shape, points: Array) -> tuple[Array, Array]:
     """Heights (n,) of points (n, 3) above a surface, about their distances, and unit normals (n, 3) there.
 

@@ -151,16 +151,15 @@ def _find_corners(loops: Sequence[Loop], shapes: Shapes, gap: float) -> _Corners
 
 
 def _end_near_corners(loops: Sequence[Loop], curves: Sequence[Curve], corners: _Corners, gap: float) -> None:
-    """Ends of runs that miss a corner of their curve by little get its number."""
+    """Ends of runs that miss a corner of their curve by little get its number, if the other end has not."""
     on = [corners.on(curve) for curve in curves]
     for loop in loops:
         for k, run in enumerate(loop.runs):
             numbers, t = on[run.curve]
             for side, end in enumerate((run.start, run.end)):
-                if loop.corners[k, side] < 0 and len(t):
-                    nearest = int(np.argmin(np.abs(t - end)))
-                    if abs(t[nearest] - end) < gap:
-                        loop.corners[k, side] = numbers[nearest]
+                away = np.where(numbers == loop.corners[k, 1 - side], np.inf, np.abs(t - end))
+                if loop.corners[k, side] < 0 and away.min(initial=np.inf) < gap:
+                    loop.corners[k, side] = numbers[np.argmin(away)]
 
 
 def _find_knots(number: int, curve: Curve, loops: Sequence[Loop], corners: _Corners, shapes: Shapes) -> Knots:

@@ -6,7 +6,7 @@ import numpy as np
 
 from bsmap_cli.core.polygons import simplify
 from bsmap_cli.merge.curves import APART, BESIDE, Curve, FacePair, Shapes, locate, onto, place, union
-from bsmap_cli.merge.shapes import Shape, SplineShape, above, parameters_of
+from bsmap_cli.merge.shapes import Shape, SplineShape, above, flattened
 from bsmap_cli.model import Array
 
 FINE = 0.02
@@ -53,13 +53,7 @@ def _traced(pair: FacePair, sides: Array, shapes: Shapes) -> Curve | None:
 def _around(shapes: Sequence[Shape], points: Array) -> Array:
     """(n,) metres about along a bent curve: by the parameter of the bent surface that changes most along it."""
     bent = next((shape for shape in shapes if isinstance(shape, SplineShape)), shapes[0])
-    uv = parameters_of(bent, points)
-    if isinstance(bent, SplineShape):
-        grid = bent.points.reshape(int(np.sqrt(len(bent.points))), -1, 3)
-        size = [np.linalg.norm(np.diff(grid, axis=axis), axis=2).sum(axis=axis).max() for axis in (0, 1)]
-    else:
-        size = list(bent.high - bent.low)
-    metres = uv * size
+    metres = flattened(bent, points)
     return np.asarray(metres[:, int(np.argmax(np.ptp(metres, axis=0)))])
 
 

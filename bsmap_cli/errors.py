@@ -10,6 +10,19 @@ class BsmapError(Exception):
     exit_code = 1
 
 
+class PlacementError(BsmapError):
+    """A map that cannot be brought together with others: they do not overlap, or it could lie elsewhere as well.
+
+    survey : its number among those given.  reason : without its name.
+    """
+
+    exit_code = 3
+
+    def __init__(self, survey: int, reason: str, name: str = "") -> None:
+        super().__init__(f"{name or f'map {survey + 1}'}: {reason}")
+        self.survey, self.reason = survey, reason
+
+
 class ParameterError(BsmapError):
     """An option's value, or a combination of options, that makes no sense."""
 

@@ -127,6 +127,7 @@ class MergeParams(Checked):
     bound_u: float = parameter(0.01, "Largest error allowed along u when a merged patch is fitted.", "m", 1e-4)
     bound_v: float = parameter(0.05, "Largest error allowed along v when a merged patch is fitted.", "m", 1e-4)
     flatness: float = parameter(0.002, "Standard deviation by which walls leave their faces.", "m", 1e-5, 0.1)
+    align: bool = parameter(False, "Bring maps of different origin into one frame first.")
     gap: float = parameter(
         0.1, "Faces of two data sets that lie no farther apart touch; the gap is closed.", "m", 0.0, 1.0
     )

@@ -1,5 +1,7 @@
 """Small maps of trimmed faces over planes, as `bsmap fit` makes them, of known truth."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from bsmap_cli.model import (
@@ -7,6 +9,7 @@ from bsmap_cli.model import (
     Crease,
     DataSet,
     HeightCovariance,
+    Placement,
     PosePart,
     Residuals,
     SurfaceMap,
@@ -170,3 +173,46 @@ def boxed(data_set, low, high, sides=tuple(SIDES)):
         for edge in shared
     ]
     return map_of(*plates, creases=lines)
+
+
+ROOM = (0.0, 0.0, 0.0), (6.0, 4.0, 2.5)
+"""Lowest and highest corner of `room`."""
+ROOM_POSE = np.diag([0.002**2, 0.003**2, 1e-7])
+"""Covariance of its data set's pose."""
+
+
+def with_poses(surface_map):
+    """The map with ROOM_POSE as error of pose of all data sets."""
+
+    def known(surface):
+        part = replace(surface.covariance.pose[0], covariance=ROOM_POSE)
+        return replace(surface, covariance=replace(surface.covariance, pose=(part,)))
+
+    return replace(surface_map, surfaces=tuple(known(surface) for surface in surface_map.surfaces))
+
+
+def cupboard(data_set, x, y, wide=1.0, deep=0.6, high=1.8):
+    """Two sides of a cupboard that stands in the corner of highest y and lowest x, as seen from the room."""
+    return (
+        plate(f"{data_set}/front", (x, y - deep, 0.0), (wide, 0.0, 0.0), (0.0, 0.0, high), (3.0, 2.0)),
+        plate(f"{data_set}/side", (x + wide, y - deep, 0.0), (0.0, deep, 0.0), (0.0, 0.0, high), (3.0, 2.0)),
+    )
+
+
+def room(data_set="set-01", noise=0.0, seed=0, extra=True):
+    """A room with a cupboard in one corner."""
+    made = with_poses(boxed(data_set, *ROOM))
+    pieces = with_poses(map_of(*cupboard(data_set, 0.0, 4.0))).surfaces if extra else ()
+    rng = np.random.default_rng(seed)
+    shifted = (
+        replace(s, control_points=s.control_points + noise * rng.standard_normal() * s.covariance.directions)
+        for s in (*made.surfaces, *pieces)
+    )
+    return replace(made, surfaces=tuple(shifted))
+
+
+def put(x, y, degrees, height=0.0, covariance=None):
+    """Placement that says where a map is to be laid, and no more."""
+    covariance = np.zeros((3, 3)) if covariance is None else covariance
+    pose = np.array([x, y, np.radians(degrees)])
+    return Placement(0, pose, height, covariance, 0.0, 0.0, 0.0, None, "unique")

@@ -5,9 +5,11 @@ from pathlib import Path
 
 import pytest
 from commands import assert_caches, assert_refused, assert_usual_refusals, bsmap, left_over, process
+from face_maps import boxed, put, room
 
 from bsmap_cli.io.artifact import read_provenance
-from bsmap_cli.io.surfaces_json import read_surfaces
+from bsmap_cli.io.surfaces_json import read_surfaces, write_surfaces
+from bsmap_cli.merge.placed import placed
 
 
 @pytest.fixture(scope="module")
@@ -58,10 +60,43 @@ def test_survey_folded_into_a_map_names_the_new_one(surfaces, tmp_path):
     assert {s.name for s in after.surfaces} >= {s.name for s in before.surfaces if len(s.data_sets) > 1}
 
 
+@pytest.fixture
+def elsewhere(tmp_path):
+    """Surfaces in a frame of their own, beside others of the same room."""
+    write_surfaces(tmp_path / "here.surfaces.json", room("set-01"))
+    path = tmp_path / "there.surfaces.json"
+    write_surfaces(path, placed(room("set-02", 0.001, 2), put(3.0, -5.0, 120.0)))
+    return path
+
+
+def test_maps_of_different_origin_are_brought_together(elsewhere, tmp_path):
+    output, picture = tmp_path / "here.map.json", tmp_path / "a.png"
+    command = ["merge", tmp_path / "here.surfaces.json", elsewhere, "--align"]
+    done = bsmap(*command, "--plot", picture)
+    assert done.code == 0, done
+    (placement,) = read_surfaces(output).placements
+    name = ("here", "there")[placement.survey] + ".surfaces.json"
+    assert f"placed {name} at x " in done.err
+    assert "unique: rival" in done.err
+    assert f"placed {name}: at x " in bsmap("info", output).out
+    first = output.read_bytes(), picture.read_bytes()
+    assert bsmap(*command, "--plot", picture, "--force").code == 0
+    assert (output.read_bytes(), picture.read_bytes()) == first
+    assert "up to date" in bsmap(*command).err
+
+
+def test_map_that_cannot_be_brought_together_with_others_is_named(elsewhere, tmp_path):
+    write_surfaces(elsewhere, boxed("set-02", (0.0, 0.0, 0.0), (1.2, 0.9, 2.5)))
+    done = bsmap("merge", tmp_path / "here.surfaces.json", elsewhere, "--align")
+    assert_refused(done, 3, ".surfaces.json: ", "they do not overlap")
+    assert not (tmp_path / "here.map.json").exists()
+
+
 def test_what_it_refuses(surfaces, tmp_path):
     assert_usual_refusals("merge", surfaces, tmp_path)
     assert_refused(bsmap("merge", surfaces, tmp_path / "gone.json"), 66, "gone.json: no such file")
     assert_refused(bsmap("merge", surfaces, "--gate", "0.1"), 2, "gate: 0.1 is outside")
+    assert_refused(bsmap("merge", surfaces, "--align"), 2, "align: one map alone")
 
 
 @pytest.mark.parametrize("ending", [".png", ".svg", ".pdf"])

@@ -1,6 +1,7 @@
 """The part of surfaces' JSON that faces need: trims, creases, covariance of heights; every refusal by its message."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from bsmap_cli.model import (
     BSplineSurface,
     Crease,
     HeightCovariance,
+    Placement,
     PosePart,
     Residuals,
     SurfaceMap,
@@ -57,6 +59,44 @@ def test_corners_are_stored_once(path):
     plain = json.loads(path.read_text())
     assert plain["corners"] == [[0.0, 0.0, 0.0]]
     assert plain["creases"][0]["points"] == [[2.0, 0.0, 0.0]]
+
+
+def test_placements_come_back(path):
+    rng = np.random.default_rng(0)
+    C = rng.normal(size=(3, 3))
+    alone = Placement(2, rng.normal(size=3), 0.125, C @ C.T, 80.5, 0.25, 0.0, None, "unique")
+    made = SurfaceMap((), (), placements=(alone, replace(alone, survey=1, rival=0.5, rival_pose=rng.normal(size=3))))
+    write_surfaces(path, made)
+    read = read_surfaces(path).placements
+    assert [p.survey for p in read] == [2, 1]
+    assert (read[0].rival_pose, read[1].rival) == (None, 0.5)
+    np.testing.assert_array_equal(read[0].pose, alone.pose)
+    np.testing.assert_array_equal(read[1].rival_pose, made.placements[1].rival_pose)
+    np.testing.assert_allclose(read[0].covariance, alone.covariance, rtol=1e-3)
+    first = path.read_bytes()
+    write_surfaces(path, read_surfaces(path))
+    assert path.read_bytes() == first
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("verdict", "likely", r"placements\[0\]: verdict is 'likely', wanted unique"),
+        ("pose", [0.0, 0.0], r"placements\[0\]: pose is 2, wanted 3"),
+        ("survey", -1, r"placements\[0\]: survey is -1, wanted 0 or more"),
+        ("rival_pose", "here", r"placements\[0\]: rival_pose is 'here', wanted numbers"),
+        ("covariance", [-1.0, 0.0, 0.0, 1.0, 0.0, 1.0], r"placements\[0\]: covariance is not positive semidefinite"),
+    ],
+)
+def test_wrong_placement_is_named(path, name, value, message):
+    write_surfaces(
+        path, SurfaceMap((), (), placements=(Placement(0, np.zeros(3), 0, np.eye(3), 1, 0, 0, None, "unique"),))
+    )
+    plain = json.loads(path.read_text())
+    plain["placements"][0][name] = value
+    path.write_text(json.dumps(plain))
+    with pytest.raises(BadInputError, match=message):
+        read_surfaces(path)
 
 
 def change(plain, value, *way):

@@ -49,7 +49,8 @@ def cli(quiet: bool) -> None:
     """From the log of two perpendicular 2D laser range finders to a 3D map of B-spline surfaces.
 
     Every stage reads and writes a file beside its input and does nothing when that file is up to date. Exit codes:
-    0 done, 1 failed, 2 usage, 65 bad input, 66 missing input, 69 missing library, 73 cannot write, 130 interrupted.
+    0 done, 1 failed, 2 usage, 3 maps that cannot be brought together, 65 bad input, 66 missing input, 69 missing
+    library, 73 cannot write, 130 interrupted.
     """
     logging.basicConfig(format="bsmap: %(levelname)s: %(message)s", level=logging.ERROR if quiet else logging.WARNING)
     logging.addLevelName(logging.WARNING, "warning")

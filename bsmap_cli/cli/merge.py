@@ -1,12 +1,14 @@
 """bsmap merge: B-spline surfaces of one run or several -> one map."""
 
 from pathlib import Path
+from typing import Any
 
 import click
 
 from bsmap_cli.cli.options import force_option, input_argument, output_option, parameters
 from bsmap_cli.cli.plots import check_plots, draw_plots, plot_option
 from bsmap_cli.cli.stage import Result, beside, run_stage
+from bsmap_cli.errors import PlacementError
 from bsmap_cli.params import MergeParams
 from bsmap_cli.track import Track
 
@@ -41,7 +43,11 @@ def make_map_file(inputs: tuple[Path, ...], output: Path, merge_params: MergePar
         from bsmap_cli.io.surfaces_json import read_surfaces, write_surfaces
         from bsmap_cli.merge import merge_surfaces
 
-        merged = merge_surfaces([read_surfaces(path) for path in inputs], merge_params, track=track)
+        maps = [read_surfaces(path) for path in inputs]
+        try:
+            merged = merge_surfaces(maps, merge_params, track=track)
+        except PlacementError as error:
+            raise PlacementError(error.survey, error.reason, str(inputs[error.survey])) from error
         outcomes = [decision.outcome for decision in merged.decisions]
         figures = {
             **map_figures(merged),
@@ -49,17 +55,27 @@ def make_map_file(inputs: tuple[Path, ...], output: Path, merge_params: MergePar
             "corners": len(merged.corners),
             "merged": outcomes.count("merged"),
             "refused": outcomes.count("refused"),
+            **{f"placed {inputs[p.survey].name}": _told(p) for p in merged.placements},
         }
         return Result([lambda path, provenance: write_surfaces(path, merged, provenance)], figures)
 
     run_stage("merge", list(inputs), [output], [merge_params], compute, force)
 
 
+def _told(placement: Any) -> str:
+    """A model.Placement in a few words."""
+    from bsmap_cli.merge.alignment import described
+
+    return f"at {described(placement.pose)} ({placement.verdict}: rival {placement.rival:.0%})"
+
+
 def _draw(inputs: tuple[Path, ...], output: Path, plots: tuple[Path, ...]) -> None:
     from bsmap_cli.io.surfaces_json import read_surfaces
+    from bsmap_cli.merge.alignment import in_one_frame
     from bsmap_cli.merge.inputs import unite
     from bsmap_cli.picture import draw_merge
 
-    before, merged = unite([read_surfaces(path) for path in inputs]).whole, read_surfaces(output)
+    merged = read_surfaces(output)
+    before = unite(in_one_frame([read_surfaces(path) for path in inputs], merged.placements)).whole
     title = output.name.removesuffix(".map.json")
     draw_plots(plots, lambda path, ending: draw_merge(path, ending, before, merged, title))

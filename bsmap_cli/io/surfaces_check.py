@@ -14,6 +14,7 @@ from bsmap_cli.model import (
     Decision,
     HeightCovariance,
     IntArray,
+    Placement,
     PosePart,
     Residuals,
     SurfaceCovariance,
@@ -53,6 +54,9 @@ def parse_map(plain: dict[str, Any]) -> SurfaceMap:
         notes=_get(plain, "notes", dict, "file"),
         creases=creases,
         corners=corners,
+        placements=tuple(
+            _placement(p, f"placements[{i}]") for i, p in enumerate(_get(plain, "placements", list, "file"))
+        ),
     )
 
 
@@ -219,15 +223,19 @@ def _symmetric(upper: Array, n: int) -> Array:
     return matrix + np.triu(matrix, 1).T
 
 
-def _pose_part(plain: Any, where: str) -> PosePart:
+def _pose_covariance(plain: Any, where: str) -> Array:
     covariance = _symmetric(_array(plain, "covariance", (6,), where), 3)
     eigenvalues = np.linalg.eigvalsh(covariance)
     if eigenvalues[0] < -BLOCK_TOLERANCE * np.abs(eigenvalues).max():
         raise MalformedError(f"{where}: covariance is not positive semidefinite (eigenvalue {eigenvalues[0]:.3g})")
+    return covariance
+
+
+def _pose_part(plain: Any, where: str) -> PosePart:
     return PosePart(
         data_set=_get(plain, "data_set", str, where),
         centre=_array(plain, "centre", (2,), where),
-        covariance=covariance,
+        covariance=_pose_covariance(plain, where),
         modes=_modes(plain, where),
         trajectory=_get(plain, "trajectory", str, where),
     )
@@ -259,6 +267,20 @@ def _decision(plain: Any, where: str) -> Decision:
         raise MalformedError(f"{where}: outcome is {outcome!r}, wanted merged or refused")
     first, second, reason = (_get(plain, key, str, where) for key in ("first", "second", "reason"))
     return Decision(first, second, outcome, reason, _get(plain, "figures", dict, where))
+
+
+def _placement(plain: Any, where: str) -> Placement:
+    verdict = _get(plain, "verdict", str, where)
+    if verdict != "unique":
+        raise MalformedError(f"{where}: verdict is {verdict!r}, wanted unique")
+    return Placement(
+        survey=_count(plain, "survey", where),
+        pose=_array(plain, "pose", (3,), where),
+        covariance=_pose_covariance(plain, where),
+        rival_pose=None if plain.get("rival_pose") is None else _array(plain, "rival_pose", (3,), where),
+        verdict=verdict,
+        **{name: _number(plain, name, where) for name in ("height", "matched", "denied", "rival")},
+    )
 
 
 def _get(plain: Any, key: str, kind: type, where: str) -> Any:

@@ -1,6 +1,6 @@
 """The artifact of `fit` and `merge`: B-spline surfaces as JSON (.surfaces.json, .map.json; .gz by name).
 
-    {"format": "bsmap-surfaces", "version": 4, "units": "metres, radians, frame map",
+    {"format": "bsmap-surfaces", "version": 5, "units": "metres, radians, frame map",
      "bsmap-provenance": {...},
      "data_sets": [{"name", "movement": "translation" | "rotation", "first_scan", "last_scan", "points"}, ...],
      "poses": [{"data_set", "centre": [x, y], "covariance": [xx, xy, xt, yy, yt, tt],
@@ -10,6 +10,9 @@
      "corners": k x 3 points in which creases end together,
      "creases": [{"surfaces": [name, name], "corners": [first, last], "points": k x 3 polyline}, ...],
                              corners: their numbers, -1 for a free end; corners are not among the points
+     "placements": [{"survey", "pose": [x, y, turn], "height", "covariance": [xx, xy, xt, yy, yt, tt],
+                     "matched", "denied", "rival", "rival_pose": [x, y, turn] or null, "verdict": "unique"}, ...],
+                             of maps that were brought into this frame, by their numbers among the inputs from 0 on
      "notes": {...}}
 
     surface = {"name", "data_sets": [names],
@@ -51,6 +54,7 @@ from bsmap_cli.model import (
     BSplineSurface,
     Crease,
     HeightCovariance,
+    Placement,
     PosePart,
     SurfaceCovariance,
     SurfaceMap,
@@ -58,7 +62,7 @@ from bsmap_cli.model import (
 )
 
 FORMAT = "bsmap-surfaces"
-VERSION = 4
+VERSION = 5
 
 
 def write_surfaces(path: Path | str, surfaces: SurfaceMap, provenance: Provenance | None = None) -> None:
@@ -82,6 +86,7 @@ def write_surfaces(path: Path | str, surfaces: SurfaceMap, provenance: Provenanc
         _list("decisions", [plain_json(asdict(decision)) for decision in surfaces.decisions]),
         _list("corners", _rounded(surfaces.corners, 5)),
         _list("creases", [_crease(crease) for crease in surfaces.creases]),
+        _list("placements", [_placement(placement) for placement in surfaces.placements]),
         f'"notes":{_dumps(plain_json(surfaces.notes))}',
     ]
     content = ("{" + ",\n".join(parts) + "}\n").encode()
@@ -163,6 +168,15 @@ def _pose_part(part: PosePart) -> dict[str, Any]:
         "trajectory": part.trajectory,
         "modes": None if part.modes is None else _significant(part.modes.T, 4),
     }
+
+
+def _placement(placement: Placement) -> dict[str, Any]:
+    arrays = {
+        "pose": placement.pose.tolist(),
+        "covariance": _significant(_upper(placement.covariance), 4),
+        "rival_pose": None if placement.rival_pose is None else placement.rival_pose.tolist(),
+    }
+    return {name: arrays[name] if name in arrays else plain_json(value) for name, value in vars(placement).items()}
 
 
 def _upper(matrix: Array) -> Array:

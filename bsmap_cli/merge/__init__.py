@@ -4,13 +4,15 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 
+from bsmap_cli.errors import ParameterError
+from bsmap_cli.merge.alignment import bring_together
 from bsmap_cli.merge.faces import merge_faces, no_faces
 from bsmap_cli.merge.inputs import separate_faces, unite
 from bsmap_cli.merge.joining import merge_pair
 from bsmap_cli.merge.pairs import Overlap, find_overlap
 from bsmap_cli.merge.patch import Patch, make_patch
 from bsmap_cli.merge.surveys import Summed, sum_up
-from bsmap_cli.model import Decision, SurfaceMap
+from bsmap_cli.model import Decision, Placement, SurfaceMap
 from bsmap_cli.params import MergeParams
 from bsmap_cli.track import Track, silent
 
@@ -45,14 +47,19 @@ def merge_surfaces(maps: Sequence[SurfaceMap], params: MergeParams, *, track: Tr
 
     Parameters
     ----------
-    maps : surface maps in one frame `map`, in any order; where names clash, those of the smaller map get a number in
-    front.
+    maps : surface maps in one frame `map` (with `align` each in its own), in any order; where names clash, those of
+    the smaller map get a number in front.
 
     Returns
     -------
     SurfaceMap of all merged and all other patches, with a decision for every pair that meets. Trimmed surfaces (faces)
     are joined whole, see `merge.faces`.
     """
+    placements: tuple[Placement, ...] = ()
+    if params.align:
+        if len(maps) < 2:
+            raise ParameterError("align: one map alone can be laid over no other one")
+        maps, placements = bring_together(maps, params, track=track)
     united, survey, survey_of_set, folds = unite(maps)
     surfaces, trimmed = separate_faces(united.surfaces)
     faces = merge_faces(trimmed, united.creases, survey, params, track=track) if trimmed else no_faces()
@@ -77,7 +84,9 @@ def merge_surfaces(maps: Sequence[SurfaceMap], params: MergeParams, *, track: Tr
     if folds:
         summed = sum_up(*summed, survey_of_set)
     creases, corners = tuple(faces.creases), faces.corners
-    return SurfaceMap(tuple(summed.surfaces), summed.data_sets, decisions, notes | faces.notes, creases, corners)
+    return SurfaceMap(
+        tuple(summed.surfaces), summed.data_sets, decisions, notes | faces.notes, creases, corners, placements
+    )
 
 
 def _test(search: _Search, pairs: Iterable[tuple[int, int]]) -> None:

@@ -26,9 +26,10 @@ class United(NamedTuple):
 def unite(maps: Sequence[SurfaceMap]) -> United:
     """Surfaces, creases and data sets of all maps in one.
 
-    Maps are taken in an order of their own, those of most data sets first (an old map before a new survey), so that
-    the order in which they are given does not matter. The first keeps its names; where another one has a name that
-    is taken, all its names get a number in front, from 2 on. Former decisions about pairs stay in their own artifacts.
+    Maps are taken in an order of their own, those of joined faces first (an old map before a new survey), then those of
+    most data sets, so that the order in which they are given does not matter. The first keeps its names; where another
+    one has a name that is taken, all its names get a number in front, from 2 on. Former decisions about pairs stay in
+    their own artifacts.
     """
     surfaces: list[BSplineSurface] = []
     creases: list[Crease] = []
@@ -37,7 +38,7 @@ def unite(maps: Sequence[SurfaceMap]) -> United:
     survey: dict[str, int] = {}
     corners: list[Array] = [np.zeros((0, 3))]
     survey_of_set: dict[str, int] = {}
-    ordered = sorted(maps, key=_order)
+    ordered = sorted(maps, key=by_extent)
     for number, given in enumerate(ordered):
         m = _named_apart(given, survey.keys(), survey_of_set.keys())
         surfaces += [_renumbered(surface, len(creases)) for surface in m.surfaces]
@@ -48,7 +49,7 @@ def unite(maps: Sequence[SurfaceMap]) -> United:
         survey |= {surface.name: number for surface in m.surfaces}
         survey_of_set |= {data_set.name: number for data_set in m.data_sets}
     whole = SurfaceMap(tuple(surfaces), tuple(data_sets), tuple(decisions), {}, tuple(creases), np.concatenate(corners))
-    folds = len(maps) > 1 and any(len(surface.data_sets) > 1 for surface in ordered[0].surfaces)
+    folds = len(maps) > 1 and _is_joined(ordered[0])
     return United(whole, survey, survey_of_set, folds)
 
 
@@ -58,10 +59,21 @@ def _with_corners_from(crease: Crease, start: int) -> Crease:
     return replace(crease, corners=(first, last))
 
 
-def _order(m: SurfaceMap) -> tuple[int, int, int, list[list[float]]]:
-    """Sorts by extent, then by content: names and order inside the map do not matter."""
+def _is_joined(m: SurfaceMap) -> bool:
+    """Whether it is a map of joined faces already."""
+    return any(len(surface.data_sets) > 1 for surface in m.surfaces)
+
+
+def by_extent(m: SurfaceMap) -> tuple[bool, int, int, int, list[list[float]]]:
+    """Sorts maps of joined faces first, then by extent, then by content: names and order inside do not matter."""
     shapes = sorted(surface.control_points.ravel().round(9).tolist() for surface in m.surfaces)
-    return -len(m.data_sets), len(m.surfaces), -sum(data_set.points for data_set in m.data_sets), shapes
+    return (
+        not _is_joined(m),
+        -len(m.data_sets),
+        len(m.surfaces),
+        -sum(data_set.points for data_set in m.data_sets),
+        shapes,
+    )
 
 
 def _named_apart(m: SurfaceMap, surfaces: Collection[str], data_sets: Collection[str]) -> SurfaceMap:

@@ -11,6 +11,7 @@ for all faces, as it is where both saw the same; else an approximation. What the
 summed up with the same weights; of all trajectories together the largest modes are kept.
 """
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -46,7 +47,7 @@ def sum_up(surfaces: Sequence[BSplineSurface], data_sets: Sequence[DataSet], sur
     for number in sorted({n for n in survey.values() if n > 0}):
         new = [d for d in data_sets if survey[d.name] == number and d.name in parts]
         into |= _partners(known, new, parts, _weights(surfaces))
-    sums = _with_common_modes(_summed_parts(surfaces, parts, into))
+    sums = with_common_modes(_summed_parts(surfaces, parts, into))
     by_name = {d.name: d for d in data_sets}
     for gone, kept in into.items():
         by_name[kept] = replace(by_name[kept], points=by_name[kept].points + by_name.pop(gone).points)
@@ -78,7 +79,7 @@ def _partners(
     return {new[i].name: known[j].name for i, j in chosen if alike[i, j] >= ALIKE}
 
 
-class _Sum(NamedTuple):
+class Sum(NamedTuple):
     """A pose part with what it has in common with others, by trajectory."""
 
     part: PosePart
@@ -87,7 +88,7 @@ class _Sum(NamedTuple):
 
 def _summed_parts(
     surfaces: Sequence[BSplineSurface], parts: Mapping[str, PosePart], into: Mapping[str, str]
-) -> dict[str, _Sum]:
+) -> dict[str, Sum]:
     """Centre, covariance and modes of all data sets that stay; the weights are left out."""
     weights = _weights(surfaces)
     out = {}
@@ -99,17 +100,20 @@ def _summed_parts(
         covariance, modes = np.zeros((3, 3)), dict[str, Array]()
         for name in names:
             part, share = parts[name], np.linalg.norm(weights[name]) / np.linalg.norm(whole)
-            T = share * _moved(centre - part.centre)
+            T = share * moved_centre(centre - part.centre)
             covariance += T @ part.covariance @ T.T
             if part.modes is not None:
                 before = modes.get(part.trajectory, np.zeros(part.modes.shape))
                 modes[part.trajectory] = before + T @ part.modes
-        out[kept] = _Sum(PosePart(kept, centre, covariance, 0.0), modes)
+        out[kept] = Sum(PosePart(kept, centre, covariance, 0.0), modes)
     return out
 
 
-def _with_common_modes(sums: Mapping[str, _Sum]) -> dict[str, PosePart]:
-    """Pose parts, the modes of all trajectories made those of one; what MOST_MODES do not hold becomes their own."""
+def with_common_modes(sums: Mapping[str, Sum]) -> dict[str, PosePart]:
+    """Pose parts, the modes of all trajectories made those of one; what MOST_MODES do not hold becomes their own.
+
+    The name of the one follows from theirs, and is as short.
+    """
     counts = {trajectory: M.shape[1] for one in sums.values() for trajectory, M in one.modes.items()}
     if not counts:
         return {name: one.part for name, one in sums.items()}
@@ -120,14 +124,14 @@ def _with_common_modes(sums: Mapping[str, _Sum]) -> dict[str, PosePart]:
     scale = np.tile([1.0, 1.0, LEVER], len(columns))[:, None]
     U, s, _ = np.linalg.svd(scale * np.concatenate(columns), full_matrices=False)
     modes = largest_positive(U[:, :MOST_MODES] * s[:MOST_MODES]) / scale
-    trajectory = "+".join(sorted({name for t in counts for name in t.split("+")}))
+    trajectory = hashlib.sha256(" ".join(sorted(counts)).encode()).hexdigest()[:8]
     return {
         name: replace(one.part, modes=modes[3 * k : 3 * k + 3], trajectory=trajectory)
         for k, (name, one) in enumerate(sums.items())
     }
 
 
-def _moved(way: Array) -> Array:
+def moved_centre(way: Array) -> Array:
     """(3, 3) from an error about one centre to that about another one, `way` (2,) off."""
     x, y = way
     return np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])

@@ -182,10 +182,36 @@ class Decision:
 
 
 @dataclass(frozen=True)
+class Placement:
+    """Where a map was laid that had a frame of its own, in that of the map it was merged with.
+
+    survey : its number among the maps given.  pose : (3,) x, y, turn of its frame.  height : metres.
+    covariance : (3, 3) of the pose, the turn about its place.
+    matched, denied : square metres of walls that lie on walls, and that stand where the other map saw bare floor.
+    rival : score of the second best placement as a share of this one's, 0 where there is none.  rival_pose : (3,).
+    verdict : "unique": no other placement comes near it.
+    """
+
+    survey: int
+    pose: Array
+    height: float
+    covariance: Array
+    matched: float
+    denied: float
+    rival: float
+    rival_pose: Array | None
+    verdict: str
+
+    def __post_init__(self) -> None:
+        check(self, pose=(3,), covariance=(3, 3))
+
+
+@dataclass(frozen=True)
 class SurfaceMap:
     """B-spline surfaces, of data sets (after fit) or of the map (after merge).
 
     creases : to which the trims of the surfaces refer.  corners : (k, 3) in map, points in which creases end together.
+    placements : of maps that were brought into this frame.
     """
 
     surfaces: tuple[BSplineSurface, ...]
@@ -194,6 +220,7 @@ class SurfaceMap:
     notes: dict[str, Any] = field(default_factory=dict)
     creases: tuple[Crease, ...] = ()
     corners: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    placements: tuple[Placement, ...] = ()
 
     def __post_init__(self) -> None:
         check(self, corners=(None, 3))

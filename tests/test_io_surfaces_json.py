@@ -175,7 +175,10 @@ WRONG = [
     (change(*S, "residuals", "points", to=-1), WHERE + "residuals: points is -1, wanted 0 or more"),
     (change(*S, "data_sets", to=[1]), WHERE + r"data_sets is \[1\], wanted a list of strings"),
     (change("data_sets", 0, "movement", to="fly"), r"data_sets\[0\] \(translation-0\): movement is 'fly', wanted tr"),
-    (change("decisions", 0, "outcome", to="maybe"), r"decisions\[0\]: outcome is 'maybe', wanted merged or refused"),
+    (
+        change("decisions", 0, "outcome", to="maybe"),
+        r"decisions\[0\]: outcome is 'maybe', wanted merged, refused, moved",
+    ),
 ]
 
 

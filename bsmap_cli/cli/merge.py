@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from bsmap_cli.cli.options import force_option, input_argument, output_option, parameters
+from bsmap_cli.cli.options import force_option, input_argument, output_option, parameters, say
 from bsmap_cli.cli.plots import check_plots, draw_plots, plot_option
 from bsmap_cli.cli.stage import Result, beside, run_stage
 from bsmap_cli.errors import PlacementError
@@ -48,6 +48,9 @@ def make_map_file(inputs: tuple[Path, ...], output: Path, merge_params: MergePar
             merged = merge_surfaces(maps, merge_params, track=track)
         except PlacementError as error:
             raise PlacementError(error.survey, error.reason, str(inputs[error.survey])) from error
+        for decision in merged.decisions:
+            if decision.outcome == "moved":
+                say(_moved(decision))
         outcomes = [decision.outcome for decision in merged.decisions]
         figures = {
             **map_figures(merged),
@@ -55,6 +58,7 @@ def make_map_file(inputs: tuple[Path, ...], output: Path, merge_params: MergePar
             "corners": len(merged.corners),
             "merged": outcomes.count("merged"),
             "refused": outcomes.count("refused"),
+            **({"moved": outcomes.count("moved")} if len(inputs) > 1 else {}),
             **{f"placed {inputs[p.survey].name}": _told(p) for p in merged.placements},
         }
         return Result([lambda path, provenance: write_surfaces(path, merged, provenance)], figures)
@@ -67,6 +71,14 @@ def _told(placement: Any) -> str:
     from bsmap_cli.merge.alignment import described
 
     return f"at {described(placement.pose)} ({placement.verdict}: rival {placement.rival:.0%})"
+
+
+def _moved(decision: Any) -> str:
+    """A model.Decision on what moved in one line."""
+    names = " and ".join(name for name in (decision.first, decision.second) if name)
+    figures = decision.figures
+    offset = f", {100.0 * figures['offset']:.1f} cm apart" if "offset" in figures else ""
+    return f"moved: {names} ({figures['area']:.2f} m2{offset}): {decision.reason}"
 
 
 def _draw(inputs: tuple[Path, ...], output: Path, plots: tuple[Path, ...]) -> None:

@@ -26,6 +26,7 @@ from bsmap_cli.model import (
 BLOCK_TOLERANCE = 1e-3
 CORRELATION_TOLERANCE = 1e-4
 HEIGHT_TOLERANCE = 1e-6
+OUTCOMES = ("merged", "refused", "moved")
 MOVEMENTS = ("translation", "rotation", "unorganised")
 
 
@@ -263,8 +264,8 @@ def _data_set(plain: Any, where: str) -> DataSet:
 
 def _decision(plain: Any, where: str) -> Decision:
     outcome = _get(plain, "outcome", str, where)
-    if outcome not in ("merged", "refused"):
-        raise MalformedError(f"{where}: outcome is {outcome!r}, wanted merged or refused")
+    if outcome not in OUTCOMES:
+        raise MalformedError(f"{where}: outcome is {outcome!r}, wanted {', '.join(OUTCOMES)}")
     first, second, reason = (_get(plain, key, str, where) for key in ("first", "second", "reason"))
     return Decision(first, second, outcome, reason, _get(plain, "figures", dict, where))
 

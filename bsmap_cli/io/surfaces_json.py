@@ -6,7 +6,7 @@
      "poses": [{"data_set", "centre": [x, y], "covariance": [xx, xy, xt, yy, yt, tt],
                 "trajectory": name, "modes": k x 3, or null where it is not known what poses have in common}, ...],
      "surfaces": [surface, ...],
-     "decisions": [{"first", "second", "outcome": "merged" | "refused", "reason", "figures": {...}}, ...],
+     "decisions": [{"first", "second", "outcome": "merged" | "refused" | "moved", "reason", "figures": {...}}, ...],
      "corners": k x 3 points in which creases end together,
      "creases": [{"surfaces": [name, name], "corners": [first, last], "points": k x 3 polyline}, ...],
                              corners: their numbers, -1 for a free end; corners are not among the points

@@ -7,10 +7,11 @@ import numpy as np
 
 from bsmap_cli.core import se2
 from bsmap_cli.errors import PlacementError
+from bsmap_cli.merge.bare import floor_level
 from bsmap_cli.merge.inputs import by_extent
 from bsmap_cli.merge.oriented import Oriented, oriented_samples, with_areas
 from bsmap_cli.merge.placed import placed
-from bsmap_cli.merge.registration import Laid, Target, floor_level, judged, placement_covariance, refined, target
+from bsmap_cli.merge.registration import Laid, Target, judged, placement_covariance, refined, target
 from bsmap_cli.merge.search import candidates
 from bsmap_cli.model import Array, Placement, SurfaceMap
 from bsmap_cli.params import MergeParams

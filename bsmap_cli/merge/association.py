@@ -8,6 +8,7 @@ from typing import NamedTuple
 from scipy.stats import chi2
 
 from bsmap_cli.merge.bases import BasedFace
+from bsmap_cli.merge.changes import MOVED
 from bsmap_cli.merge.comparison import Pair, compare, near, prepared
 from bsmap_cli.model import Decision
 from bsmap_cli.params import MergeParams
@@ -18,6 +19,7 @@ COMPARED = 4
 """Faces of one group, those that overlap most, with which a further face is compared: the cost stays linear."""
 SIGNIFICANT = 0.99999
 """Share of the pairs that did not move for which an offset is not taken for a movement between two surveys."""
+MOVED_REASON = "it moved between two surveys"
 COVERED = 0.5
 """Share of the smaller of two faces that the other one covers, from which on they are taken for the same thing."""
 
@@ -131,7 +133,7 @@ def _with_moved(
         covered = pair.area > COVERED * min(faces[pair.first].area, faces[pair.second].area)
         apart = surveys[group[pair.first]].isdisjoint(surveys[group[pair.second]])
         if covered and apart and not pair.opposite and pair.distance > least:
-            moved.append((pair, "it moved between two surveys"))
+            moved.append((pair, MOVED_REASON))
         else:
             others.append((pair, reason))
     return [*moved, *others]
@@ -166,4 +168,4 @@ def _decision(faces: Sequence[BasedFace], pair: Pair, reason: str | None) -> Dec
     rounded = {key: float(f"{value:.4g}") for key, value in figures.items()}
     if reason is None:
         return Decision(*names, "merged", "the same face", rounded)
-    return Decision(*names, "refused", reason, rounded)
+    return Decision(*names, MOVED if reason == MOVED_REASON else "refused", reason, rounded)

@@ -10,6 +10,7 @@ from bsmap_cli.merge.adjustment import Correction, adjust, moved, moved_crease, 
 from bsmap_cli.merge.assembly import Group, assemble
 from bsmap_cli.merge.association import associate
 from bsmap_cli.merge.bases import BasedFace, based_face, has_base
+from bsmap_cli.merge.changes import MOVED, find_changes
 from bsmap_cli.merge.frames import common_frame
 from bsmap_cli.merge.information import join, tell
 from bsmap_cli.model import Array, BSplineSurface, Crease, Decision
@@ -68,6 +69,8 @@ def merge_faces(
     based = {face.surface.name for face in faces}
     others = [surface for surface in surfaces if surface.name not in based]
     track("merging faces", 2, 2)
+    told = {name for d in decisions if d.outcome == MOVED for name in (d.first, d.second)}
+    decisions += find_changes([[f.surface for f in group.faces] for group in groups], surfaces, survey, told)
     made, lines, corners = assemble(groups, others, creases, params.gap)
     notes = {
         "faces_before": float(len(surfaces)),

@@ -45,7 +45,7 @@ def unite(maps: Sequence[SurfaceMap]) -> United:
         creases += [_with_corners_from(crease, sum(map(len, corners))) for crease in m.creases]
         corners.append(m.corners)
         data_sets += sorted(m.data_sets, key=lambda data_set: data_set.name)
-        decisions += [decision for decision in m.decisions if decision.first and not decision.second]
+        decisions += [d for d in m.decisions if d.first and not d.second and d.outcome == "refused"]
         survey |= {surface.name: number for surface in m.surfaces}
         survey_of_set |= {data_set.name: number for data_set in m.data_sets}
     whole = SurfaceMap(tuple(surfaces), tuple(data_sets), tuple(decisions), {}, tuple(creases), np.concatenate(corners))

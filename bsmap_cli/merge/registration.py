@@ -3,13 +3,12 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.ndimage import binary_closing, binary_dilation, binary_erosion
 from scipy.spatial import cKDTree
 
 from bsmap_cli.core import se2
+from bsmap_cli.merge.bare import Bare, bare_floor
 from bsmap_cli.merge.oriented import STEP, Oriented
-from bsmap_cli.merge.search import DENIED, HIGH, LOW
+from bsmap_cli.merge.search import DENIED
 from bsmap_cli.model import Array, IntArray
 
 REACHES = (0.5, 0.4, 0.3, 0.2, 0.15, 0.1, 0.1, 0.1)
@@ -22,22 +21,6 @@ BEHIND = 0.5
 """Metres before or behind a wall where no other one can be seen that looks the same way: one would hide the other."""
 INDEPENDENT = 1.0
 """Square metres of a wall whose samples err alike, for walls and poses err over their length."""
-
-
-class Bare(NamedTuple):
-    """Where a map shows floor and no wall on it.  low : (2,) corner of the grid.  cells : (k, l).  floor : metres."""
-
-    low: Array
-    cells: NDArray[np.bool_]
-    floor: float
-
-    def at(self, xy: Array) -> NDArray[np.bool_]:
-        """(n,) whether there is bare floor at places (n, 2)."""
-        cell = np.floor((xy - self.low) / STEP).astype(int)
-        inside = np.all((cell >= 0) & (cell < self.cells.shape), axis=1)
-        out = np.zeros(len(xy), dtype=bool)
-        out[inside] = self.cells[tuple(cell[inside].T)]
-        return out
 
 
 class Target(NamedTuple):
@@ -82,28 +65,6 @@ def thinned(samples: Oriented) -> Oriented:
         return samples
     some = samples.of(np.sort(np.random.default_rng(0).choice(total, FEW, replace=False)))
     return some._replace(areas=some.areas * total / FEW)
-
-
-def bare_floor(samples: Oriented) -> Bare:
-    """Floor less what is nearer than about two cells to its border or to a wall that stands on it.
-
-    Where a map lacks a wall, as one of few scans does, its floor ends there all the same.
-    """
-    low = np.floor(samples.points[:, :2].min(axis=0) / STEP) * STEP
-    cell = np.floor((samples.points[:, :2] - low) / STEP).astype(int)
-    floor, z, level = samples.floor, samples.points[:, 2], floor_level(samples)
-    seen, walls = np.zeros((2, *(cell.max(axis=0) + 1)), dtype=bool)
-    seen[tuple(cell[floor].T)] = True
-    walls[tuple(cell[samples.steep & (z > level + LOW) & (z < level + HIGH)].T)] = True
-    around = np.ones((3, 3), dtype=bool)
-    inner = binary_erosion(binary_closing(np.pad(seen, 2), around), around, 2)[2:-2, 2:-2]
-    return Bare(low, inner & ~binary_dilation(walls, around), level)
-
-
-def floor_level(samples: Oriented) -> float:
-    """Height of the floor, metres in map; 0, on which robots stand, where none was seen."""
-    floor = samples.floor
-    return float(np.median(samples.points[floor, 2])) if floor.any() else 0.0
 
 
 class _Pairs(NamedTuple):
@@ -175,9 +136,7 @@ def _compared(fixed: Target, moved: Oriented, distance: float) -> tuple[Array, f
     good[pairs.numbers] = np.maximum(1.0 - (pairs.offsets / distance) ** 2, 0.0)
     behind = np.zeros(len(good), dtype=bool)
     behind[pairs.numbers] = pairs.aside < 1.5 * STEP
-    z = moved.points[:, 2]
-    standing = (z > fixed.bare.floor + LOW) & (z < fixed.bare.floor + HIGH) & fixed.bare.at(moved.points[:, :2])
-    denied = moved.steep & (good == 0.0) & (standing | behind)
+    denied = moved.steep & (good == 0.0) & (fixed.bare.under(moved.points) | behind)
     return good, float(moved.areas[denied].sum())
 
 

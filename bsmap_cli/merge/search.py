@@ -13,6 +13,7 @@ from scipy.fft import fft2, ifft2, next_fast_len
 from scipy.ndimage import binary_dilation, binary_erosion, convolve, gaussian_filter1d, maximum_filter
 
 from bsmap_cli.core import se2
+from bsmap_cli.merge.bare import HIGH, LOW
 from bsmap_cli.merge.oriented import Oriented
 from bsmap_cli.model import Array
 
@@ -28,8 +29,6 @@ LEAST_SCORE = 1.0
 """Square metres that must speak for a placement."""
 DENIED = 10.0
 """Square metres of walls on walls for which one that stands on bare floor speaks: furniture moves, walls do not."""
-LOW, HIGH = 0.15, 1.8
-"""Metres above the floor between which a wall stands in the way of a robot: there the floor tells that none is."""
 
 
 class Plan(NamedTuple):

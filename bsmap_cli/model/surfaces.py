@@ -172,11 +172,11 @@ class DataSet:
 
 @dataclass(frozen=True)
 class Decision:
-    """What merging did with two surfaces or patches, and why."""
+    """What merging did with two surfaces or patches (or with one, `second` being empty), and why."""
 
     first: str
     second: str
-    outcome: str  # "merged" or "refused"
+    outcome: str  # "merged", "refused", or "moved": not the same in two surveys
     reason: str
     figures: dict[str, float] = field(default_factory=dict)
 

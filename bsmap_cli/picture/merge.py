@@ -92,27 +92,35 @@ def _draw_legend(axes: Any, by_set: dict[str, Any]) -> None:
         axes.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=8, fontsize=7, frameon=False)
 
 
+OUTCOMES = (
+    ("merged", "joined", {"color": "tab:green", "linestyle": "-", "marker": "o", "ms": 3}),
+    ("refused", "refused", {"color": "magenta", "linestyle": ":", "marker": "x", "ms": 6}),
+    ("moved", "moved", {"color": "tab:red", "linestyle": "-", "marker": "D", "ms": 5}),
+)
+"""Outcomes of decisions in the order in which they are drawn, what they are called, and how they look."""
+
+
 def _draw_decisions(axes: Any, inputs: Sequence[BSplineSurface], decisions: Sequence[Decision], limits: Array) -> None:
-    """A line between the middles of the two surfaces of each decision, over the outlines of the input."""
+    """A line between the middles of the two surfaces of each decision, over the outlines of the input; what moved with
+    its own outline.
+    """
     from matplotlib.collections import LineCollection
 
-    lines = [outlines(surface) for surface in inputs]
-    flat = [line[:, :2] for one in lines for line in one]
-    axes.add_collection(LineCollection(flat, colors="0.8", linewidths=0.6, zorder=1))
-    middle = {s.name: np.concatenate(one)[:, :2].mean(axis=0) for s, one in zip(inputs, lines, strict=True)}
+    lines = {s.name: [line[:, :2] for line in outlines(s)] for s in inputs}
+    axes.add_collection(LineCollection([x for one in lines.values() for x in one], colors="0.8", linewidths=0.6))
+    middle = {name: np.concatenate(one).mean(axis=0) for name, one in lines.items()}
     counts = []
-    for outcome, color, style, marker, what in (
-        ("merged", "tab:green", "-", "o", "joined"),
-        ("refused", "magenta", ":", "x", "refused"),
-    ):
-        some = [d for d in decisions if d.outcome == outcome]
-        ends = [[middle[d.first], middle[d.second]] for d in some if d.first in middle and d.second in middle]
-        counts.append(
-            f"{len(some)} {what} ({len(ends)} of them drawn)" if len(ends) < len(some) else f"{len(some)} {what}"
-        )
-        if ends:
-            axes.add_collection(LineCollection(ends, colors=color, linewidths=0.8, linestyles=style, zorder=2))
-            axes.plot(*np.concatenate(ends).T, marker, c=color, ms=3 if marker == "o" else 6, zorder=3, label=what)
+    for outcome, what, style in OUTCOMES:
+        some = [[name for name in (d.first, d.second) if name] for d in decisions if d.outcome == outcome]
+        drawn = [names for names in some if names and all(name in middle for name in names)]
+        if some or outcome != "moved":
+            counts.append(f"{len(some)} {what}" + (f" ({len(drawn)} of them drawn)" if len(drawn) < len(some) else ""))
+        if outcome == "moved":
+            moved = [line for names in drawn for name in names for line in lines[name]]
+            axes.add_collection(LineCollection(moved, colors=style["color"], linewidths=2.0, zorder=2))
+        for number, names in enumerate(drawn):
+            xy = np.array([middle[name] for name in names])
+            axes.plot(*xy.T, linewidth=0.8, zorder=3, label=what if number == 0 else None, **style)
     set_up(axes, PLAN, limits, "decisions on pairs, between their middles: " + ", ".join(counts))
     if axes.get_legend_handles_labels()[0]:
         axes.legend(loc="best", fontsize=8)

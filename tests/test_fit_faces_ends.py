@@ -11,6 +11,7 @@ from bsmap_cli.fit.crossings import find_crossings
 from bsmap_cli.fit.division import find_faces
 from bsmap_cli.fit.ends import doubtful_cells, find_ends, on_faces, within_ends
 from bsmap_cli.fit.faces import fit_set
+from bsmap_cli.fit.feet import tabulate
 from bsmap_cli.fit.heights import offset
 from bsmap_cli.fit.labels import feet_of_faces
 from bsmap_cli.model import SurfaceMap
@@ -69,7 +70,7 @@ def corner():
 
 def test_crossings_moved_back_lie_on_all_three_faces(corner):
     grid, labels, fields, crossings, ends = corner
-    settled = within_ends(grid, labels, fields, crossings, ends)
+    settled = within_ends(grid, labels, tabulate(fields), crossings, ends)
     moved = np.flatnonzero(np.linalg.norm(settled.points - crossings.points, axis=1) > 0.0)
     assert len(moved)
     assert crossings.points[moved, 2].max() > 3.01
@@ -81,7 +82,7 @@ def test_crossings_moved_back_lie_on_all_three_faces(corner):
 
 def test_nothing_is_doubted_in_a_room_without_convex_corners(corner):
     grid, labels, fields, crossings, ends = corner
-    assert not doubtful_cells(grid, labels, fields, crossings, ends).any()
+    assert not doubtful_cells(grid, labels, tabulate(fields), crossings, ends).any()
 
 
 def test_ends_name_the_face_behind_the_border(corner):

@@ -8,7 +8,7 @@ from bsmap_cli.evaluate import distance_to_mesh
 from bsmap_cli.fit.beams import make_grid
 from bsmap_cli.fit.division import find_faces
 from bsmap_cli.fit.heights import CylinderBase, PlaneBase, basis_matrix, evaluate, least_knots
-from bsmap_cli.fit.labels import drop_alike, feet_of_faces
+from bsmap_cli.fit.labels import feet_of_faces, find_misses, without_alike
 
 SIGMA = 0.03
 SEEDS = (0, 3, 5)
@@ -59,7 +59,8 @@ def test_beams_that_miss_a_face_together_leave_it():
     moved = grid.points.copy()
     patch = np.s_[row - 2 : row + 3, column - 2 : column + 3]
     moved[patch] += 3.0 * faces.sigma * grid.directions[patch]
-    labels = drop_alike(grid._replace(points=moved), faces.labels, fields, faces.sigma)
+    grid = grid._replace(points=moved)
+    labels = without_alike(grid, find_misses(grid, faces.labels, fields), faces.sigma)
     assert np.all(labels[row - 1 : row + 2, column - 1 : column + 2] == -1)
     assert np.count_nonzero(labels != faces.labels) < 40
 

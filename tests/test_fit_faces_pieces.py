@@ -3,8 +3,10 @@
 import numpy as np
 from face_scenes import corridor_set
 
+from bsmap_cli.core.bspline import clamped_knots
 from bsmap_cli.fit.beams import make_grid
-from bsmap_cli.fit.heights import CylinderBase, HeightField, PlaneBase, evaluate, find_feet, flat_knots, offset
+from bsmap_cli.fit.feet import find_feet, offsets, tabulate
+from bsmap_cli.fit.heights import CylinderBase, HeightField, Knots, PlaneBase, evaluate, flat_knots, offset
 from bsmap_cli.fit.pieces import find_pieces
 
 
@@ -34,6 +36,13 @@ def fields():
     return [HeightField(base, low, high, flat_knots(), heights) for base in (plane, cylinder)]
 
 
+def bent_field():
+    """Cubic and quadratic, with inner knots."""
+    knots = Knots(3, 2, clamped_knots(3, [0.25, 0.5]), clamped_knots(2, [0.5]))
+    heights = np.random.default_rng(4).normal(scale=0.05, size=knots.shape)
+    return HeightField(fields()[0].base, np.array([-0.5, -0.3]), np.array([1.2, 0.9]), knots, heights)
+
+
 def test_feet_lie_on_the_field_and_on_their_beams():
     rng = np.random.default_rng(0)
     for field in fields():
@@ -44,7 +53,8 @@ def test_feet_lie_on_the_field_and_on_their_beams():
         directions = -normals + 0.3 * rng.normal(size=normals.shape)
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         along = rng.normal(scale=0.02, size=50)
-        feet = find_feet(field, points + along[:, None] * directions, directions, 8)
+        one = np.zeros(50, dtype=int)
+        feet = find_feet(tabulate([field]), one, points + along[:, None] * directions, directions)
         np.testing.assert_allclose(feet.beyond, -along, atol=1e-7)
         np.testing.assert_allclose(feet.points, points, atol=1e-7)
 
@@ -57,3 +67,22 @@ def test_normals_are_the_gradient_of_the_offset():
         step = 1e-6
         raised = offset(field, points + step * normal)[0]
         np.testing.assert_allclose((raised - value) / step, 1.0, atol=0.02)
+
+
+def test_many_faces_at_once_give_the_feet_and_offsets_of_each():
+    rng = np.random.default_rng(3)
+    every = [*fields(), bent_field()]
+    face = rng.integers(len(every), size=3000)
+    points = rng.normal(size=(3000, 3)) * 0.3 + np.array([1.0, 1.0, 2.0])
+    directions = rng.normal(size=(3000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    feet = find_feet(tabulate(every), face, points, directions, steps=1)
+    value, normal = offsets(tabulate(every), face, points)
+    for number, field in enumerate(every):
+        of = face == number
+        alone = find_feet(tabulate([field]), np.zeros(of.sum(), dtype=int), points[of], directions[of], steps=1)
+        np.testing.assert_allclose(feet.beyond[of], alone.beyond, atol=1e-12)
+        np.testing.assert_allclose(feet.uv[of], alone.uv, atol=1e-12)
+        one_value, one_normal = offset(field, points[of])
+        np.testing.assert_allclose(value[of], one_value, atol=1e-12)
+        np.testing.assert_allclose(normal[of], one_normal, atol=1e-12)

@@ -4,6 +4,7 @@ The Taylor coefficients about the middle of every piece are computed once. A poi
 a gather of its coefficients and Horner's scheme, which gives the derivatives by the way.
 """
 
+from functools import lru_cache
 from math import factorial
 from typing import NamedTuple
 
@@ -51,8 +52,8 @@ class Pieces(NamedTuple):
 
 def polynomial_pieces(surface: Surface) -> Pieces:
     """Taylor coefficients of all pieces of a surface about their middles."""
-    along_u, to_u = _expansion(surface.knots_u, surface.degree_u)
-    along_v, to_v = _expansion(surface.knots_v, surface.degree_v)
+    along_u, to_u = _expansion(np.asarray(surface.knots_u, dtype=np.float64).tobytes(), surface.degree_u)
+    along_v, to_v = _expansion(np.asarray(surface.knots_v, dtype=np.float64).tobytes(), surface.degree_v)
     nu, nv, d = surface.control_points.shape
     rows = (to_u @ surface.control_points.reshape(nu, -1)).reshape(-1, nv, d)
     ku, kv = len(along_u.middle), len(along_v.middle)
@@ -61,8 +62,13 @@ def polynomial_pieces(surface: Surface) -> Pieces:
     return Pieces(along_u, along_v, coefficients.reshape(*coefficients.shape[:3], ku * kv))
 
 
-def _expansion(knots: Array, degree: int) -> tuple[Spans, Array]:
-    """Spans, and the matrix (k (degree + 1), n_control) from control points to the coefficients of each."""
+@lru_cache(maxsize=256)
+def _expansion(packed: bytes, degree: int) -> tuple[Spans, Array]:
+    """Spans, and the matrix (k (degree + 1), n_control) from control points to the coefficients of each.
+
+    packed : the knots as float64; the same few return in many surfaces.
+    """
+    knots = np.frombuffer(packed)
     ends = np.unique(knots)
     middle, half = (ends[1:] + ends[:-1]) / 2, np.diff(ends) / 2
     first, values = basis_functions(knots, degree, middle, degree)
@@ -106,6 +112,12 @@ def _evaluate_chunk(pieces: Pieces, u: Array, v: Array, derivatives: int, result
         np.multiply(along_u[2, 0], 2 * du * du, out=result[3])
         np.multiply(along_u[1, 1], du * dv, out=result[4])
         np.multiply(along_u[0, 2], 2 * dv * dv, out=result[5])
+
+
+def horner(coefficients: Array, x: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Values (n,) and derivatives by x and y of polynomials with coefficients (q + 1, p + 1, n), those of y outside."""
+    along = _taylor(_taylor(coefficients, y, 1).swapaxes(0, 1), x, 1, crossed=True)
+    return along[0, 0], along[1, 0], along[0, 1]
 
 
 def _place(spans: Spans, u: Array) -> tuple[NDArray[np.intp], Array, Array]:

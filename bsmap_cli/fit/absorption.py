@@ -5,8 +5,9 @@ from numpy.typing import NDArray
 
 from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.clutter import INCIDENCE
+from bsmap_cli.fit.feet import Table, tabulate
 from bsmap_cli.fit.heights import HeightField
-from bsmap_cli.fit.labels import ADOPTED, feet_of
+from bsmap_cli.fit.labels import ADOPTED, feet_at
 from bsmap_cli.fit.pieces import JUNK_BEAM
 from bsmap_cli.fit.selection import PRICE
 from bsmap_cli.model import Array, IntArray
@@ -23,15 +24,15 @@ def absorb(grid: BeamGrid, labels: IntArray, fields: list[HeightField], sigma: f
     The price of a face is the chi square of its beams and that of its control points; that of the others is the chi
     square to the best of them, for beams that none explains that of junk. Beams go to the best one, or to the rest.
     """
-    labels = labels.copy()
+    labels, table = labels.copy(), tabulate(fields)
     count = np.bincount(labels[(labels >= 0) & grid.hit], minlength=len(fields))
     for number in np.argsort(count, kind="stable").tolist():
         mask = (labels == number) & grid.hit
         if count[number] > SMALL or not mask.any():
             continue
-        own = _chi(grid, fields[number], mask, sigma).sum() + PRICE * fields[number].knots.size
         larger = np.flatnonzero(count > count[number])
-        others = np.array([_chi(grid, fields[k], mask, sigma) for k in larger]).reshape(len(larger), -1)
+        chi = _chi(grid, table, np.append(larger, number), mask, sigma)
+        own, others = chi[-1].sum() + PRICE * fields[number].knots.size, chi[:-1]
         least = others.min(axis=0, initial=JUNK_BEAM)
         if least.sum() < own:
             labels[labels == number] = -1
@@ -41,9 +42,12 @@ def absorb(grid: BeamGrid, labels: IntArray, fields: list[HeightField], sigma: f
     return labels
 
 
-def _chi(grid: BeamGrid, field: HeightField, mask: NDArray[np.bool_], sigma: float) -> Array:
-    """(k,) chi square of the beams of a mask to a face, at most that of junk, where the face may reach them."""
-    feet = feet_of(grid, field, mask)
-    room = REACH / (field.high - field.low)
+def _chi(grid: BeamGrid, table: Table, faces: IntArray, mask: NDArray[np.bool_], sigma: float) -> Array:
+    """(f, k) chi square of the beams of a mask to faces (f,), at most that of junk, where the face may reach them."""
+    row, column = np.nonzero(mask)
+    face = np.repeat(faces, len(row))
+    feet = feet_at(grid, table, face, np.tile(row, len(faces)), np.tile(column, len(faces)))
+    room = (REACH / table.size).T[face]
     near = np.all((feet.uv > -room) & (feet.uv < 1.0 + room), axis=1) & (np.abs(feet.slope) > INCIDENCE)
-    return np.where(near, np.minimum((feet.beyond / sigma) ** 2, JUNK_BEAM), JUNK_BEAM)
+    chi = np.where(near, np.minimum((feet.beyond / sigma) ** 2, JUNK_BEAM), JUNK_BEAM)
+    return np.asarray(chi.reshape(len(faces), -1))

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.ends import THROUGH, Ends
-from bsmap_cli.fit.heights import HeightField, find_feet
-from bsmap_cli.fit.labels import OUTLIER
+from bsmap_cli.fit.feet import tabulate
+from bsmap_cli.fit.heights import HeightField
+from bsmap_cli.fit.labels import OUTLIER, feet_at
 from bsmap_cli.fit.outline import CORNERS
 from bsmap_cli.model import IntArray
 
@@ -62,11 +63,9 @@ def _bare(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], ends:
     behind = np.zeros((m, n), dtype=bool)
     first = np.unique(row * n + last, return_index=True)[1]
     first = first[ended[first]]
-    for number in np.unique(labels[row[first], column[first]]):
-        of = first[labels[row[first], column[first]] == number]
-        beams = row[of], following[of]
-        feet = find_feet(fields[number], grid.points[beams], grid.directions[beams])
-        behind[row[of], last[of]] = feet.beyond < -BEHIND - OUTLIER * grid.sigma
+    face = labels[row[first], column[first]]
+    feet = feet_at(grid, tabulate(fields), face, row[first], following[first])
+    behind[row[first], last[first]] = feet.beyond < -BEHIND - OUTLIER * grid.sigma
     out = np.zeros((m, n), dtype=bool)
     out[row, column] = behind[row, last]
     return out

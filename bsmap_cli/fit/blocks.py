@@ -14,6 +14,10 @@ FEWEST = 3
 """Blocks of a run, if it has so many beams: one alone would not tell how the surface lies along the scan."""
 LONGEST = 0.2
 """Metres from the first to the last beam of a block: over it a surface must be flat to much less than the noise."""
+NARROW = 0.02
+"""Metres from the first to the last scan of blocks taken together."""
+FEWEST_ROWS = 20
+"""Rows of blocks that must be left of a face."""
 
 
 class Blocks(NamedTuple):
@@ -61,3 +65,30 @@ def make_blocks(grid: BeamGrid, row: IntArray, start: IntArray, stop: IntArray) 
     mean /= counts[:, None]
     directions = mean[:, 3:6] / np.linalg.norm(mean[:, 3:6], axis=1, keepdims=True)
     return Blocks(mean[:, :3], directions, counts, flat[first] // n, mean[:, 6], owner[first])
+
+
+def thinned(blocks: Blocks) -> Blocks:
+    """Blocks of one face, those of neighbouring scans taken together as long as these lie within NARROW.
+
+    Over so short a way even a pillar is flat to less than what the noise leaves of a mean. Scans farther apart stay.
+    """
+    cell = (blocks.column / LARGEST).astype(np.int64)
+    order = np.lexsort((blocks.row, cell))
+    successive = order[:-1][(np.diff(cell[order]) == 0) & (np.diff(blocks.row[order]) == 1)]
+    following = order[1:][(np.diff(cell[order]) == 0) & (np.diff(blocks.row[order]) == 1)]
+    if not len(successive):
+        return blocks
+    steps = np.linalg.norm(blocks.points[successive] - blocks.points[following], axis=1)
+    scans = int(min(NARROW / np.quantile(steps, 0.95), np.ptp(blocks.row) / FEWEST_ROWS)) + 1
+    if scans < 2:
+        return blocks
+    group = blocks.row // scans
+    order = np.lexsort((cell, group))
+    first = np.flatnonzero((np.diff(cell[order], prepend=-1) != 0) | (np.diff(group[order], prepend=-1) != 0))
+    weight = blocks.counts[order]
+    counts = np.add.reduceat(weight, first)
+    values = np.column_stack([blocks.points, blocks.directions, blocks.column])[order]
+    mean = np.add.reduceat(values * weight[:, None], first) / counts[:, None]
+    directions = mean[:, 3:6] / np.linalg.norm(mean[:, 3:6], axis=1, keepdims=True)
+    head = order[first]
+    return Blocks(mean[:, :3], directions, counts, blocks.row[head], mean[:, 6], blocks.owner[head])

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bsmap_cli.fit.beams import BeamGrid
-from bsmap_cli.fit.heights import HeightField, offset
+from bsmap_cli.fit.feet import Table, offsets, tabulate
+from bsmap_cli.fit.heights import HeightField
 from bsmap_cli.model import Array, IntArray
 
 STEPS = 8
@@ -45,9 +46,10 @@ class Crossings(NamedTuple):
 def find_crossings(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField]) -> Crossings:
     """Crossings on all edges between neighbouring beams of two faces."""
     numbers, points, faces, count = [], [], [], 0
+    table = tabulate(fields)
     for step in ((0, 1), (1, 0)):
         number = np.full(labels.shape, -1)
-        found, at, pair = _on_edges(grid, labels, fields, step)
+        found, at, pair = _on_edges(grid, labels, table, step)
         number[found] = count + np.arange(len(at))
         count += len(at)
         numbers.append(number)
@@ -58,7 +60,7 @@ def find_crossings(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightFiel
 
 
 def _on_edges(
-    grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], step: tuple[int, int]
+    grid: BeamGrid, labels: IntArray, table: Table, step: tuple[int, int]
 ) -> tuple[tuple[IntArray, IntArray], Array, IntArray]:
     """First beams (row, column) of the edges with a crossing, the points (k, 3), the two faces (k, 2)."""
     m, n = labels.shape
@@ -67,7 +69,7 @@ def _on_edges(
     row, column = np.nonzero((a != b) & (a >= 0) & (b >= 0) & hit)
     pair = np.column_stack([a[row, column], b[row, column]])
     ends = [_beam(grid, row, column), _beam(grid, row + step[0], column + step[1])]
-    points, good = _meet(fields, pair, ends[0], ends[1], grid.sigma)
+    points, good = _meet(table, pair, ends[0], ends[1], grid.sigma)
     return (row[good], column[good]), points[good], pair[good]
 
 
@@ -77,7 +79,7 @@ def _beam(grid: BeamGrid, row: IntArray, column: IntArray) -> tuple[Array, Array
 
 
 def _meet(
-    fields: Sequence[HeightField],
+    table: Table,
     pair: IntArray,
     first: tuple[Array, Array],
     second: tuple[Array, Array],
@@ -94,7 +96,7 @@ def _meet(
     points = (p0 + p1) / 2.0
     reach = np.maximum(np.linalg.norm(way, axis=1), 4.0 * sigma)
     for _ in range(STEPS):
-        values, normals = _offsets(fields, pair, points)
+        values, normals = _offsets(table, pair, points)
         J = np.stack([normals[0], normals[1], across], axis=1)
         off_plane = np.sum((points - p0) * across, axis=1)
         determinant = np.linalg.det(J)
@@ -106,7 +108,7 @@ def _meet(
         points = points - step * np.minimum(1.0, reach / length)[:, None]
         if length.max(initial=0.0) < EXACT:
             break
-    values, _ = _offsets(fields, pair, points)
+    values, _ = _offsets(table, pair, points)
     settled = crossing & (np.max(np.abs(values), axis=0) < SETTLED)
     lengths = np.linalg.norm(points - p0, axis=1) + np.linalg.norm(points - p1, axis=1)
     near = lengths < FARTHEST * np.linalg.norm(way, axis=1) + 2.0 * sigma
@@ -126,11 +128,7 @@ def _between(points: Array, first: tuple[Array, Array], second: tuple[Array, Arr
     return np.asarray((share > -SHARE) & (share < 1.0 + SHARE))
 
 
-def _offsets(fields: Sequence[HeightField], pair: IntArray, points: Array) -> tuple[Array, Array]:
+def _offsets(table: Table, pair: IntArray, points: Array) -> tuple[Array, Array]:
     """(2, k) heights of points above both faces, over the gradient's length, and (2, k, 3) unit normals."""
-    values, normals = np.empty((2, len(points))), np.empty((2, len(points), 3))
-    for side in (0, 1):
-        for number in np.unique(pair[:, side]):
-            of = pair[:, side] == number
-            values[side, of], normals[side, of] = offset(fields[number], points[of])
-    return values, normals
+    value, normal = offsets(table, pair.T.ravel(), np.concatenate([points, points]))
+    return value.reshape(2, -1), normal.reshape(2, -1, 3)

@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 from bsmap_cli.fit.absorption import absorb
 from bsmap_cli.fit.beams import BeamGrid
-from bsmap_cli.fit.blocks import Blocks, make_blocks
+from bsmap_cli.fit.blocks import Blocks, make_blocks, thinned
 from bsmap_cli.fit.clutter import find_planes
 from bsmap_cli.fit.crossings import find_crossings
-from bsmap_cli.fit.heights import Base, CylinderBase, HeightField, plane_base
-from bsmap_cli.fit.labels import adopt, drop_alike, drop_outliers, fill, move_breaks, runs_of
+from bsmap_cli.fit.heights import Base, CylinderBase, HeightField, PlaneBase, plane_base
+from bsmap_cli.fit.labels import adopt, fill, find_misses, move_breaks, runs_of, without_alike, without_outliers
 from bsmap_cli.fit.lowmodels import fit_cylinder_frame, fit_plane_frame
 from bsmap_cli.fit.pieces import find_pieces
 from bsmap_cli.fit.regions import find_regions
@@ -26,6 +26,8 @@ FARTHEST = 1.0
 """Metres by which a face's rectangle may grow towards its creases."""
 BELIEVED = 0.9
 """Share of its beams that a face must fit."""
+LITTLE = 0.05
+"""Share of its beams in which a face has hardly changed."""
 ROUNDS = 2
 """Of dividing the beams anew by the fitted surfaces."""
 
@@ -55,20 +57,18 @@ def find_faces(grid: BeamGrid) -> Faces:
     rng = np.random.default_rng(0)
     for step in range(ROUNDS):
         fields = [f.field for f in fitted]
-        labels = drop_outliers(grid, labels, fields, sigma)
-        labels = adopt(grid, labels, fields, sigma)
-        labels = move_breaks(grid, labels, fields, sigma)
-        labels = drop_alike(grid, labels, fields, sigma)
+        misses = find_misses(grid, labels, fields)
+        divided = adopt(grid, without_outliers(misses, sigma), fields, sigma)
+        divided = move_breaks(grid, divided, fields, sigma)
+        divided = without_alike(grid, find_misses(grid, divided, fields, misses), sigma)
         if step < ROUNDS - 1:
-            labels = find_planes(grid, labels, sigma, rng)
-        labels, kept = _kept(labels, grid)
-        if step < ROUNDS - 1:
-            fitted = _fit_all(grid, labels, sigma)
+            divided = find_planes(grid, divided, sigma, rng)
+            labels, fitted = _fit_changed(grid, labels, divided, fitted, sigma)
             after = absorb(grid, labels, [f.field for f in fitted], sigma)
             if np.any(after != labels):
-                labels = _renumber(fill(grid, after), grid)
-                fitted = _fit_all(grid, labels, sigma)
+                labels, fitted = _fit_changed(grid, labels, fill(grid, after), fitted, sigma)
         else:
+            labels, kept = _kept(divided, grid)
             fitted = _refit_all(grid, labels, [fields[k] for k in kept], sigma)
     labels, kept = _believed(grid, labels, [f.field for f in fitted], sigma)
     fitted = [fitted[k] for k in kept]
@@ -96,7 +96,7 @@ def _widened(grid: BeamGrid, labels: IntArray, fitted: list[Fitted], sigma: floa
 
 def _believed(grid: BeamGrid, labels: IntArray, fields: list[HeightField], sigma: float) -> tuple[IntArray, IntArray]:
     """Labels without outliers, nor the faces that many beams deny; and the numbers of the others."""
-    final = drop_outliers(grid, labels, fields, sigma)
+    final = without_outliers(find_misses(grid, labels, fields), sigma)
     for number in range(len(fields)):
         before, after = (int(np.count_nonzero((a == number) & grid.hit)) for a in (labels, final))
         if after < BELIEVED * before:
@@ -124,11 +124,36 @@ def blocks_of_faces(grid: BeamGrid, labels: IntArray) -> list[Blocks]:
     runs = runs_of(labels)
     blocks = make_blocks(grid, runs.row, runs.start, runs.stop)
     of_face = runs.label[blocks.owner]
-    return [blocks.pick(of_face == k) for k in range(int(labels.max(initial=-1)) + 1)]
+    return [thinned(blocks.pick(of_face == k)) for k in range(int(labels.max(initial=-1)) + 1)]
 
 
 def _fit_all(grid: BeamGrid, labels: IntArray, sigma: float) -> list[Fitted]:
     return [_fit(grid, labels == k, blocks, sigma) for k, blocks in enumerate(blocks_of_faces(grid, labels))]
+
+
+def _fit_changed(
+    grid: BeamGrid, before: IntArray, after: IntArray, fitted: list[Fitted], sigma: float
+) -> tuple[IntArray, list[Fitted]]:
+    """Labels `after`, numbered anew, and their faces; those that were `fitted` to nearly the same beams are kept."""
+    labels, kept = _kept(after, grid)
+    out = []
+    for number, (old, blocks) in enumerate(zip(kept.tolist(), blocks_of_faces(grid, labels), strict=True)):
+        member = labels == number
+        changed = np.count_nonzero(member != (before == old)) if old < len(fitted) else len(member)
+        if changed == 0:
+            out.append(fitted[old])
+        elif old < len(fitted) and _is_flat(fitted[old].field) and changed < LITTLE * np.count_nonzero(member):
+            # What was flat with nearly the same beams stays so.
+            field = fitted[old].field
+            low, high = _rectangle(grid, member, field.base)
+            out.append(refit(replace(field, low=low, high=high), blocks, sigma))
+        else:
+            out.append(_fit(grid, member, blocks, sigma))
+    return labels, out
+
+
+def _is_flat(field: HeightField) -> bool:
+    return isinstance(field.base, PlaneBase) and field.knots.shape == (2, 2)
 
 
 def _fit(grid: BeamGrid, member: NDArray[np.bool_], blocks: Blocks, sigma: float) -> Fitted:
@@ -169,6 +194,7 @@ def _rectangle(grid: BeamGrid, member: NDArray[np.bool_], base: Base) -> tuple[A
         steps = np.abs(np.diff(st, axis=axis)).reshape(-1, 2)
         steps = steps[np.isfinite(steps[:, 0])]
         if len(steps):
-            margin = np.maximum(margin, 1.2 * np.percentile(steps, 95, axis=0))
+            usual = int(0.95 * (len(steps) - 1))
+            margin = np.maximum(margin, 1.2 * np.partition(steps, usual, axis=0)[usual])
     margin = np.minimum(margin, 0.6)
     return low - margin, high + margin

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bsmap_cli.fit.beams import BeamGrid
-from bsmap_cli.fit.crossings import FARTHEST, SETTLED, Crossings
-from bsmap_cli.fit.heights import Feet, HeightField, offset
+from bsmap_cli.fit.crossings import EXACT, FARTHEST, SETTLED, Crossings
+from bsmap_cli.fit.feet import Feet, Table, offsets
 from bsmap_cli.fit.labels import runs_of
 from bsmap_cli.model import Array, IntArray
 
@@ -65,9 +65,7 @@ def on_faces(grid: BeamGrid, labels: IntArray, feet: Sequence[Feet]) -> BeamGrid
     return grid._replace(points=points)
 
 
-def within_ends(
-    grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], crossings: Crossings, ends: Ends
-) -> Crossings:
+def within_ends(grid: BeamGrid, labels: IntArray, table: Table, crossings: Crossings, ends: Ends) -> Crossings:
     """Crossings between scans, those beyond an end of one of their faces moved back to it along the crease.
 
     Where the crease does not reach the end nearby, there is no crossing. The grid's points lie on their faces.
@@ -78,9 +76,9 @@ def within_ends(
     reach = FARTHEST * np.linalg.norm(grid.points[row, column] - grid.points[row + 1, column], axis=1)
     for next_scan in (0, 1):
         for side in (0, 1):
-            end = _End(grid, fields, ends, side, row + next_scan, column)
+            end = _End(grid, table, ends, side, row + next_scan, column)
             wrong = np.flatnonzero(end.beyond(points[number]) > BEYOND)
-            moved, settled = _meet_end(fields, crossings.faces[number[wrong]], points[number[wrong]], end, wrong)
+            moved, settled = _meet_end(table, crossings.faces[number[wrong]], points[number[wrong]], end, wrong)
             settled &= np.linalg.norm(moved - crossings.points[number[wrong]], axis=1) < reach[wrong]
             points[number[wrong[settled]]] = moved[settled]
             gone[number[wrong[~settled]]] = True
@@ -89,9 +87,7 @@ def within_ends(
     return crossings._replace(across=across, points=points)
 
 
-def passed_through(
-    grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], crossings: Crossings, ends: Ends
-) -> Crossings:
+def passed_through(grid: BeamGrid, labels: IntArray, table: Table, crossings: Crossings, ends: Ends) -> Crossings:
     """Crossings between scans, marked where the scan that hits one face passes through the other.
 
     A wall ends between two scans; the one beyond its end sees the floor go on behind the wall's place: there the wall
@@ -104,20 +100,17 @@ def passed_through(
         other = row + 1 - side
         start, stop = ends.last[0, other, column], ends.last[1, other, column]
         face = crossings.faces[number, side]
-        for k in np.unique(face):
-            of = np.flatnonzero((face == k) & (start >= 0))
-            first, last = (offset(fields[k], grid.points[other[of], end[of]])[0] for end in (start, stop))
-            passed[number[of], side] = (np.minimum(first, last) < -THROUGH) & (np.maximum(first, last) > THROUGH)
+        of = np.flatnonzero(start >= 0)
+        first, last = (offsets(table, face[of], grid.points[other[of], end[of]])[0] for end in (start, stop))
+        passed[number[of], side] = (np.minimum(first, last) < -THROUGH) & (np.maximum(first, last) > THROUGH)
     return crossings._replace(passed=passed)
 
 
 class _End:
     """One end of the runs of k beams: the face met there, or the plane across the scan line at the last beam."""
 
-    def __init__(
-        self, grid: BeamGrid, fields: Sequence[HeightField], ends: Ends, side: int, row: IntArray, column: IntArray
-    ) -> None:
-        self.fields, self.face = fields, ends.face[side, row, column]
+    def __init__(self, grid: BeamGrid, table: Table, ends: Ends, side: int, row: IntArray, column: IntArray) -> None:
+        self.table, self.face = table, ends.face[side, row, column]
         last, inner = ends.last[side, row, column], ends.inner[side, row, column]
         self.place = grid.points[row, last]
         within = grid.points[row, inner]
@@ -137,41 +130,36 @@ class _End:
         """(j,) distances of points (j, 3) to the ends `at` (j,), of either sign, and (j, 3) unit normals."""
         normals = self.way[at].copy()
         values = np.sum((points - self.place[at]) * normals, axis=1)
-        for number in np.unique(self.face[at]):
-            if number >= 0:
-                of = self.face[at] == number
-                values[of], normals[of] = offset(self.fields[number], points[of])
+        of = np.flatnonzero(self.face[at] >= 0)
+        values[of], normals[of] = offsets(self.table, self.face[at[of]], points[of])
         return values, normals
 
 
-def _meet_end(
-    fields: Sequence[HeightField], pair: IntArray, points: Array, end: _End, at: IntArray
-) -> tuple[Array, NDArray[np.bool_]]:
+def _meet_end(table: Table, pair: IntArray, points: Array, end: _End, at: IntArray) -> tuple[Array, NDArray[np.bool_]]:
     """Points (j, 3) moved onto two faces `pair` (j, 2) and the ends `at`, by Newton's method; and which got there."""
     good = np.ones(len(points), dtype=bool)
     for _ in range(STEPS):
-        values, normals = _three(fields, pair, points, end, at)
+        values, normals = _three(table, pair, points, end, at)
         good &= np.abs(np.linalg.det(normals)) > FLATTEST
         normals[~good] = np.eye(3)
-        points = points - np.where(good[:, None], np.linalg.solve(normals, values[:, :, None])[:, :, 0], 0.0)
-    return points, good & (np.abs(_three(fields, pair, points, end, at)[0]).max(axis=1, initial=0.0) < SETTLED)
+        step = np.where(good[:, None], np.linalg.solve(normals, values[:, :, None])[:, :, 0], 0.0)
+        points = points - step
+        if np.abs(step).max(initial=0.0) < EXACT:
+            break
+    return points, good & (np.abs(_three(table, pair, points, end, at)[0]).max(axis=1, initial=0.0) < SETTLED)
 
 
-def _three(
-    fields: Sequence[HeightField], pair: IntArray, points: Array, end: _End, at: IntArray
-) -> tuple[Array, Array]:
+def _three(table: Table, pair: IntArray, points: Array, end: _End, at: IntArray) -> tuple[Array, Array]:
     """(j, 3) distances to two faces and an end, (j, 3, 3) normals."""
     values, normals = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
     for side in (0, 1):
-        for number in np.unique(pair[:, side]):
-            of = pair[:, side] == number
-            values[of, side], normals[of, side] = offset(fields[number], points[of])
+        values[:, side], normals[:, side] = offsets(table, pair[:, side], points)
     values[:, 2], normals[:, 2] = end.values(points, at)
     return values, normals
 
 
 def doubtful_cells(
-    grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], crossings: Crossings, ends: Ends
+    grid: BeamGrid, labels: IntArray, table: Table, crossings: Crossings, ends: Ends
 ) -> NDArray[np.bool_]:
     """(m - 1, n - 1) cells that reach through a face in which one of their two scans shows their face to end.
 
@@ -179,15 +167,15 @@ def doubtful_cells(
     the corner's other face is seen, too, both tell where it stands, and only the cells that hold it are doubtful. The
     grid's points lie on their faces: with their noise they would seem to lie beyond.
     """
-    bad = _behind(grid, labels, fields, ends)
-    straight, rising, falling = (_through(grid, labels, fields, crossings, ends, step) for step in (0, 1, -1))
+    bad = _behind(grid, labels, table, ends)
+    straight, rising, falling = (_through(grid, labels, table, crossings, ends, step) for step in (0, 1, -1))
     return np.asarray((bad | straight)[:, :-1] | (bad | straight)[:, 1:] | rising[:, :-1] | falling[:, 1:])
 
 
 def _through(
     grid: BeamGrid,
     labels: IntArray,
-    fields: Sequence[HeightField],
+    table: Table,
     crossings: Crossings,
     ends: Ends,
     step: int,
@@ -208,7 +196,7 @@ def _through(
         # Two runs that end at the same face say nothing of what is between them, nor do two that end openly.
         differ = faces[0] != faces[1]
         r, c = row[differ], column[differ]
-        first, second = (_End(grid, fields, ends, side, r + k, c + k * step) for k in (0, 1))
+        first, second = (_End(grid, table, ends, side, r + k, c + k * step) for k in (0, 1))
         here, there = grid.points[r, c], grid.points[r + 1, c + step]
         a0, a1, b0, b1 = first.beyond(here), first.beyond(there), second.beyond(here), second.beyond(there)
         corner = met[r, first.face, second.face]
@@ -234,7 +222,7 @@ def _corners(labels: IntArray, crossings: Crossings) -> NDArray[np.bool_]:
     return out
 
 
-def _behind(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], ends: Ends) -> NDArray[np.bool_]:
+def _behind(grid: BeamGrid, labels: IntArray, table: Table, ends: Ends) -> NDArray[np.bool_]:
     """(m - 1, n) whether one beam hits a face, the other one a face that ends it, and the first lies beyond that.
 
     The run of the one face shows, at its end, on which side of it the other one lies in that scan.
@@ -248,7 +236,7 @@ def _behind(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], end
             follows = ends.face[side, row + there, column] == face
             r, c = row[follows], column[follows]
             neighbour = _first_beyond(labels, ends, side, r + there, c, step)
-            end = _End(grid, fields, ends, 1 - side, r + there, neighbour)
+            end = _End(grid, table, ends, 1 - side, r + there, neighbour)
             wrong = (end.face == ender[follows]) & (end.beyond(grid.points[r + here, c]) > THROUGH)
             bad[r[wrong], c[wrong]] = True
     return bad

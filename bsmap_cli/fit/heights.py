@@ -15,11 +15,6 @@ from bsmap_cli.core.pieces import Pieces, evaluate_pieces, polynomial_pieces
 from bsmap_cli.fit.lowmodels import axes_of
 from bsmap_cli.model import Array
 
-SETTLED = 1e-6
-"""Metres; a step of Newton's method below this is the last one."""
-STEEPEST = 0.05
-"""Smallest sine between beam and surface that counts."""
-
 
 def _turned(vectors: Array, axes: Array) -> Array:
     """Vectors (..., 3) in axes (3, 3); of a plain list, columns in one piece: long operations on them are quick."""
@@ -40,10 +35,6 @@ class PlaneBase(NamedTuple):
     def local(self, points: Array) -> Array:
         """(..., 3) s, t, h of points (..., 3)."""
         return _turned(points - self.origin, self.axes)
-
-    def turn(self, local: Array, directions: Array) -> Array:
-        """(..., 3) change of s, t, h along unit directions (..., 3) at places `local`."""
-        return _turned(directions, self.axes)
 
     def normal(self, local: Array, gradient: Array) -> Array:
         """(n, 3) gradient in map of the height above a field whose own is (n, 2) at places `local` (n, 3)."""
@@ -66,14 +57,6 @@ class CylinderBase(NamedTuple):
         x, y = points[..., 0] - self.centre[0], points[..., 1] - self.centre[1]
         angle = (np.arctan2(y, x) - self.middle + np.pi) % (2.0 * np.pi) - np.pi
         return np.stack([angle * self.radius, points[..., 2], np.hypot(x, y) - self.radius], axis=-1)
-
-    def turn(self, local: Array, directions: Array) -> Array:
-        angle = local[..., 0] / self.radius + self.middle
-        c, s = np.cos(angle), np.sin(angle)
-        outwards = directions[..., 0] * c + directions[..., 1] * s
-        around = directions[..., 1] * c - directions[..., 0] * s
-        distance = np.maximum(self.radius + local[..., 2], 0.1 * self.radius)
-        return np.stack([around * self.radius / distance, directions[..., 2], outwards], axis=-1)
 
     def normal(self, local: Array, gradient: Array) -> Array:
         angle = local[:, 0] / self.radius + self.middle
@@ -145,19 +128,6 @@ class HeightField:
         return polynomial_pieces(TensorSpline(k.degree_s, k.degree_t, k.s, k.t, self.heights[:, :, None]))
 
 
-class Feet(NamedTuple):
-    """Where beams meet a height field.
-
-    uv : (n, 2) parameters, not clamped.  beyond : (n,) metres from the measured point on to the foot, along the beam.
-    slope : (n,) change of height over the surface along the beam.  points : (n, 3) in map.
-    """
-
-    uv: Array
-    beyond: Array
-    slope: Array
-    points: Array
-
-
 def evaluate(field: HeightField, uv: Array) -> tuple[Array, Array]:
     """Heights (n,) and their gradients (n, 2) by s and t; beyond the rectangle the surface goes on straight."""
     if field.knots.shape == (2, 2):
@@ -179,31 +149,6 @@ def _bilinear(field: HeightField, uv: Array) -> tuple[Array, Array]:
     return a + (c - a) * u + (b - a) * v + twist * u * v, gradient
 
 
-def find_feet(field: HeightField, points: Array, directions: Array, steps: int = 3) -> Feet:
-    """Feet of beams through points (n, 3) along unit directions (n, 3), by Newton's method from the points."""
-    beyond = np.zeros(len(points))
-    start, turn = field.base.local(points), np.zeros_like(points)
-    # Over a plane s, t and h change evenly along a beam.
-    straight = isinstance(field.base, PlaneBase)
-    if straight:
-        turn = field.base.turn(start, directions)
-    done = False
-    for step in range(steps + 1):
-        local = start + beyond[:, None] * turn if straight else field.base.local(points + beyond[:, None] * directions)
-        uv = field.parameters(local)
-        height, gradient = evaluate(field, uv)
-        if not straight:
-            turn = field.base.turn(local, directions)
-        slope = turn[:, 2] - gradient[:, 0] * turn[:, 0] - gradient[:, 1] * turn[:, 1]
-        slope = np.where(np.abs(slope) < STEEPEST, np.where(slope < 0.0, -STEEPEST, STEEPEST), slope)
-        if done or step == steps:
-            break
-        move = np.clip((local[:, 2] - height) / slope, -5.0, 5.0)
-        beyond = beyond - move
-        done = bool(np.abs(move).max(initial=0.0) < SETTLED)
-    return Feet(uv, beyond, slope, points + beyond[:, None] * directions)
-
-
 def offset(field: HeightField, points: Array) -> tuple[Array, Array]:
     """Heights (n,) of points (n, 3) above the field, to first order their distances, and unit normals (n, 3) there."""
     local = field.base.local(points)
@@ -218,11 +163,9 @@ def plane_base(points: Array, normal: Array) -> PlaneBase:
     origin = points.mean(axis=0)
     axes = axes_of(normal)
     flat = (points - origin) @ axes[:, :2]
-    areas = []
     angles = np.radians(np.arange(0.0, 90.0, 3.0))
-    for angle in angles:
-        c, s = np.cos(angle), np.sin(angle)
-        areas.append(np.ptp(flat @ [c, s]) * np.ptp(flat @ [-s, c]))
+    ways = np.stack([np.cos(angles), np.sin(angles)])
+    areas = np.ptp(ways.T @ flat.T, axis=1) * np.ptp(np.stack([-ways[1], ways[0]]).T @ flat.T, axis=1)
     # Walls stay level unless another rectangle is much smaller.
     best = int(np.argmin(areas))
     if abs(axes[2, 2]) < 0.9 and areas[best] > 0.8 * areas[0]:

@@ -1,20 +1,23 @@
 """Which face each beam belongs to: outliers dropped, beams of the rest adopted, borders moved to the creases."""
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from bsmap_cli.fit.beams import BeamGrid
-from bsmap_cli.fit.heights import STEEPEST, Feet, HeightField, find_feet
+from bsmap_cli.fit.feet import STEEPEST, Feet, Table, find_feet, tabulate
+from bsmap_cli.fit.heights import HeightField
 from bsmap_cli.model import Array, IntArray
 
 OUTLIER, ADOPTED = 4.5, 3.5
 """Standard deviations beyond which a beam leaves its face, within which one of the rest joins a neighbouring face."""
 ALIKE = ((3, 3), (7, 1))
 """Scans and beams of neighbourhoods whose misses are added up."""
+NEXT = ((-1, 0), (1, 0), (0, -2), (0, -1), (0, 1), (0, 2))
+"""Scans and beams from a beam to those that its face may adopt."""
 PASSES = 30
 REACH = 12
 """Beams by which a border may move at once."""
@@ -42,77 +45,119 @@ def runs_of(labels: IntArray) -> Runs:
     return Runs(row[keep], start[keep], (stop - row * n)[keep], label[keep])
 
 
+def feet_at(grid: BeamGrid, table: Table, face: IntArray, row: IntArray, column: IntArray) -> Feet:
+    """Feet of beams (k,) on the faces (k,) of a table."""
+    return find_feet(table, face, grid.points[row, column], grid.directions[row, column])
+
+
 def feet_of(grid: BeamGrid, field: HeightField, mask: NDArray[np.bool_]) -> Feet:
     """Feet of the beams of a mask (m, n) on a height field."""
-    return find_feet(field, grid.points[mask], grid.directions[mask])
+    row, column = np.nonzero(mask)
+    return feet_at(grid, tabulate([field]), np.zeros(len(row), dtype=np.int64), row, column)
 
 
 def feet_of_faces(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField]) -> list[Feet]:
     """Feet of the beams of each face that have a return, in the order of the grid."""
-    return [feet_of(grid, field, (labels == number) & grid.hit) for number, field in enumerate(fields)]
+    row, column = np.nonzero((labels >= 0) & grid.hit)
+    face = labels[row, column]
+    order = np.argsort(face, kind="stable")
+    feet = feet_at(grid, tabulate(fields), face[order], row[order], column[order])
+    bounds = np.searchsorted(face[order], np.arange(len(fields) + 1))
+    return [Feet(*(of[a:b] for of in feet)) for a, b in itertools.pairwise(bounds.tolist())]
 
 
-def drop_outliers(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], sigma: float) -> IntArray:
+class Misses(NamedTuple):
+    """Labels (m, n), and metres (m, n) from the point on to the beam's face, along the beam; 0 for beams without."""
+
+    labels: IntArray
+    beyond: Array
+
+
+def find_misses(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], known: Misses | None = None) -> Misses:
+    """How all beams miss their faces; known: the same for other labels, which is kept where these agree."""
+    beyond = np.zeros(labels.shape) if known is None else np.where(labels >= 0, known.beyond, 0.0)
+    new = (labels >= 0) & grid.hit
+    if known is not None:
+        new &= labels != known.labels
+    row, column = np.nonzero(new)
+    beyond[row, column] = feet_at(grid, tabulate(fields), labels[row, column], row, column).beyond
+    return Misses(labels, beyond)
+
+
+def without_outliers(misses: Misses, sigma: float) -> IntArray:
     """Labels without the beams that miss their face by more than noise, or that graze it."""
-    labels = labels.copy()
-    for number, field in enumerate(fields):
-        mask = (labels == number) & grid.hit
-        feet = feet_of(grid, field, mask)
-        labels[mask] = np.where(np.abs(feet.beyond) < OUTLIER * sigma, number, -1)
-    return labels
+    return np.where(np.abs(misses.beyond) < OUTLIER * sigma, misses.labels, -1)
 
 
-def drop_alike(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], sigma: float) -> IntArray:
+def without_alike(grid: BeamGrid, misses: Misses, sigma: float) -> IntArray:
     """Labels without the beams that miss their face by less than an outlier, but together with their neighbours.
 
     The side of a recess that is no deeper than the gate of outliers would otherwise be shared out to the faces above
     and below it.
     """
-    labels = labels.copy()
-    for number, field in enumerate(fields):
-        mask = (labels == number) & grid.hit
-        miss, count = np.zeros(labels.shape), mask.astype(float)
-        miss[mask] = np.clip(feet_of(grid, field, mask).beyond / sigma, -OUTLIER, OUTLIER)
-        for window in ALIKE:
-            total, number_of = (ndimage.convolve(of, np.ones(window), mode="constant") for of in (miss, count))
-            labels[mask & (np.abs(total) > OUTLIER * np.sqrt(number_of)) & (miss * total > 0.0)] = -1
-    return labels
+    labels = misses.labels
+    member = (labels >= 0) & grid.hit
+    miss = np.clip(misses.beyond / sigma, -OUTLIER, OUTLIER)
+    own = np.where(member, labels, -1)
+    alike = np.zeros(labels.shape, dtype=bool)
+    for window in ALIKE:
+        total, count = _window_sums(own, miss, window)
+        alike |= member & (np.abs(total) > OUTLIER * np.sqrt(count)) & (miss * total > 0.0)
+    return np.where(alike, -1, labels)
+
+
+def _window_sums(own: IntArray, values: Array, window: tuple[int, int]) -> tuple[Array, Array]:
+    """(m, n) sums of the values of beams of the same face in a window around each, and their number."""
+    (m, n), reach = own.shape, (window[0] // 2, window[1] // 2)
+    margins = [(r, r) for r in reach]
+    faces, padded = np.pad(own, margins, constant_values=-1), np.pad(values, margins)
+    total, count = np.zeros(own.shape), np.zeros(own.shape)
+    for i, k in itertools.product(range(window[0]), range(window[1])):
+        span = slice(i, i + m), slice(k, k + n)
+        same = faces[span] == own
+        total += np.where(same, padded[span], 0.0)
+        count += same
+    return total, count
 
 
 def adopt(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], sigma: float) -> IntArray:
     """Give beams of the rest to a neighbouring face that predicts them, until none is left that can have one."""
-    labels = labels.copy()
+    labels, table = labels.copy(), tabulate(fields)
     tried = np.zeros((len(fields), *labels.shape), dtype=bool)
     for _ in range(PASSES):
         free = (labels < 0) & grid.hit
-        best = np.full(labels.shape, np.inf)
-        new = np.full(labels.shape, -1)
-        for number, field in enumerate(fields):
-            near = _grown(labels == number) & free & ~tried[number]
-            if not near.any():
-                continue
-            tried[number] |= near
-            feet = feet_of(grid, field, near)
-            miss = np.where(np.abs(feet.slope) > STEEPEST, np.abs(feet.beyond), np.inf)
-            better = np.zeros(labels.shape, dtype=bool)
-            better[near] = (miss < ADOPTED * sigma) & (miss < best[near])
-            best[better] = miss[better[near]]
-            new[better] = number
-        if np.all(new < 0):
+        face, row, column = _candidates(labels, free, tried)
+        tried[face, row, column] = True
+        feet = feet_at(grid, table, face, row, column)
+        miss = np.where(np.abs(feet.slope) > STEEPEST, np.abs(feet.beyond), np.inf)
+        order = np.lexsort((face, miss))
+        order = order[miss[order] < ADOPTED * sigma][::-1]
+        if not len(order):
             break
-        labels = np.where(new >= 0, new, labels)
+        # The last one written is the best.
+        labels[row[order], column[order]] = face[order]
     return fill(grid, labels)
 
 
-def _grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Mask with its neighbours, one away in scans and two in beams."""
-    out = mask.copy()
-    out[1:] |= mask[:-1]
-    out[:-1] |= mask[1:]
-    for step in (1, 2):
-        out[:, step:] |= mask[:, :-step]
-        out[:, :-step] |= mask[:, step:]
-    return out
+def _candidates(
+    labels: IntArray, free: NDArray[np.bool_], tried: NDArray[np.bool_]
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Face, row and column (k,) of free beams beside a face that has not tried them."""
+    m, n = labels.shape
+    row, column = np.nonzero(free)
+    faces = [np.zeros(0, dtype=np.int64)]
+    at = [np.zeros(0, dtype=np.int64)]
+    for up, step in NEXT:
+        r, c = row + up, column + step
+        inside = np.flatnonzero((r >= 0) & (r < m) & (c >= 0) & (c < n))
+        face = labels[r[inside], c[inside]]
+        faces.append(face[face >= 0])
+        at.append(inside[face >= 0])
+    number, beam = np.concatenate(faces), np.concatenate(at)
+    pairs = np.unique(number * len(row) + beam) if len(row) else number
+    face, beam = pairs // max(1, len(row)), pairs % max(1, len(row))
+    new = ~tried[face, row[beam], column[beam]]
+    return face[new], row[beam[new]], column[beam[new]]
 
 
 def fill(grid: BeamGrid, labels: IntArray, widest: int = 3) -> IntArray:
@@ -129,91 +174,86 @@ def fill(grid: BeamGrid, labels: IntArray, widest: int = 3) -> IntArray:
     return labels
 
 
-class _Border(NamedTuple):
-    """Between two faces of one scan: row, last beam of face a, first beam of face b."""
+class _Borders(NamedTuple):
+    """Between two faces of one scan, (k,) each: row, last beam of face a, first beam of face b.
 
-    row: int
-    last: int
-    first: int
-    a: int
-    b: int
+    second : whether it is the second, fourth ... of successive borders of a scan: it shares a face with the one before.
+    """
+
+    row: IntArray
+    last: IntArray
+    first: IntArray
+    a: IntArray
+    b: IntArray
+    second: NDArray[np.bool_]
 
 
-def _borders(labels: IntArray) -> list[_Border]:
-    runs = runs_of(labels)
-    next_to = (runs.row[1:] == runs.row[:-1]) & (runs.start[1:] - runs.stop[:-1] <= 3)
-    return [
-        _Border(
-            int(runs.row[k]), int(runs.stop[k]) - 1, int(runs.start[k + 1]), int(runs.label[k]), int(runs.label[k + 1])
-        )
-        for k in np.flatnonzero(next_to & (runs.label[1:] != runs.label[:-1]))
-    ]
+def _borders(labels: IntArray) -> _Borders:
+    row, start, stop, label = runs_of(labels)
+    near = (row[1:] == row[:-1]) & (start[1:] - stop[:-1] <= 3) & (label[1:] != label[:-1])
+    k = np.flatnonzero(near)
+    return _Borders(row[k], stop[k] - 1, start[k + 1], label[k], label[k + 1], k % 2 == 1)
 
 
 def move_breaks(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], sigma: float) -> IntArray:
     """Move borders to where the two surfaces give the same range; where they do not meet, to where they fit best."""
-    borders = _borders(labels)
-    ranges = _ranges_around(grid, labels.shape, borders, fields)
+    borders, table = _borders(labels), tabulate(fields)
     labels = labels.copy()
-    for border in borders:
-        low, high = _window(labels, border)
-        span = slice(low, high)
-        a, b = ranges[border.a][border.row, span], ranges[border.b][border.row, span]
-        place = low + _best_break(a, b, border.last + 1 - low, sigma)
-        row = labels[border.row]
-        row[low:place], row[place:high] = border.a, border.b
-        miss = np.concatenate([a[: place - low], b[place - low :]])
-        row[span][np.abs(miss) > OUTLIER * sigma] = -1
-    return np.where(grid.hit, labels, -1) if not len(borders) else fill(grid, labels)
+    # Successive borders may want the same beams: every second one moves first.
+    for second in (False, True):
+        _move(grid, labels, table, _Borders(*(of[borders.second == second] for of in borders)), sigma)
+    return np.where(grid.hit, labels, -1) if not len(borders.row) else fill(grid, labels)
 
 
-def _window(labels: IntArray, border: _Border) -> tuple[int, int]:
-    """Beams around a border that belong to its two faces, or to none in between."""
-    row = labels[border.row]
-    low, high = border.last, border.first + 1
-    while low > 0 and border.last - low < REACH and row[low - 1] == border.a:
-        low -= 1
-    while high < len(row) and high - border.first <= REACH and row[high] == border.b:
-        high += 1
-    return low, high
+def _move(grid: BeamGrid, labels: IntArray, table: Table, borders: _Borders, sigma: float) -> None:
+    """Write into the labels where borders go that have no beams in common."""
+    row, last, first, a, b, _ = borders
+    n = labels.shape[1]
+    at = last[:, None] + np.arange(-REACH, REACH + 5)
+    column = np.clip(at, 0, n - 1)
+    inside = (at >= 0) & (at < n) & (at <= (first + REACH)[:, None])
+    found = labels[row[:, None], column]
+    # On each side as far as the beams are the face's own, or between the two.
+    left = np.where(at < last[:, None], inside & (found == a[:, None]), True)
+    left = np.logical_and.accumulate(left[:, ::-1], axis=1)[:, ::-1]
+    right = np.where(at > first[:, None], inside & (found == b[:, None]), True)
+    right = np.logical_and.accumulate(right, axis=1)
+    window = left & right
+    to_a, to_b = np.full((2, *window.shape), np.nan)
+    k, i = np.nonzero(window & grid.hit[row[:, None], column])
+    for way, face in ((to_a, a), (to_b, b)):
+        way[k, i] = feet_at(grid, table, face[k], row[k], column[k, i]).beyond
+    place = _best_breaks(to_a, to_b, np.full(len(row), REACH + 1), sigma)
+    before = np.arange(at.shape[1]) < place[:, None]
+    miss = np.where(before, to_a, to_b)
+    new = np.where(np.abs(miss) > OUTLIER * sigma, -1, np.where(before, a[:, None], b[:, None]))
+    k, i = np.nonzero(window)
+    labels[row[k], column[k, i]] = new[k, i]
 
 
-def _ranges_around(
-    grid: BeamGrid, shape: tuple[int, ...], borders: list[_Border], fields: Sequence[HeightField]
-) -> list[Array]:
-    """For each face (m, n) metres from the measured point to the face along the beam, around its borders; else nan."""
-    wanted = np.zeros((len(fields), *shape), dtype=bool)
-    for border in borders:
-        span = slice(max(0, border.last - REACH), border.first + REACH + 1)
-        wanted[border.a, border.row, span] = wanted[border.b, border.row, span] = True
-    out = []
-    for field, mask in zip(fields, wanted, strict=True):
-        beyond = np.full(shape, np.nan)
-        mask &= grid.hit
-        if mask.any():
-            beyond[mask] = feet_of(grid, field, mask).beyond
-        out.append(beyond)
-    return out
+def _best_breaks(a: Array, b: Array, now: IntArray, sigma: float) -> IntArray:
+    """Place (k,) of the first beam of the second face, of beams with distances a and b (k, w) to the two faces.
 
-
-def _best_break(a: Array, b: Array, now: int, sigma: float) -> int:
-    """Number of beams, of those with distances a and b (k,) to the two faces, that belong to the first.
-
-    Where the surfaces cross near the border: the crossing. Else where the squared distances are least in sum.
+    Where the surfaces cross near the border: the crossing. Else where the squared distances are least in sum. nan for
+    beams without; where fewer than two are left, the place is `now` (k,).
     """
-    known = np.flatnonzero(np.isfinite(a) & np.isfinite(b))
-    if len(known) < 2:
-        return now
-    difference = (a - b)[known]
+    count = np.count_nonzero(np.isfinite(a), axis=1)
+    order = np.argsort(~np.isfinite(a), axis=1, kind="stable")
+    a, b = (np.take_along_axis(x, order, axis=1) for x in (a, b))
+    known = np.arange(a.shape[1]) < count[:, None]
     limit = 6.0 * sigma
-    ea, eb = (np.minimum(np.abs(x[known]), limit) ** 2 for x in (a, b))
-    total = np.concatenate([[0.0], np.cumsum(ea)]) + np.concatenate([np.cumsum(eb[::-1])[::-1], [0.0]])
-    crossing = np.flatnonzero(np.sign(difference[1:]) != np.sign(difference[:-1])) + 1
-    if len(crossing):
-        # A crossing is believed where it explains the beams nearly as well as the best break.
-        good = crossing[total[crossing] < total.min() + 25.0 * sigma**2]
-        if len(good):
-            best = int(good[np.argmin(total[good])])
-            return int(known[best])
-    best = int(np.argmin(total))
-    return int(known[best]) if best < len(known) else int(known[-1]) + 1
+    ea, eb = (np.where(known, np.minimum(np.abs(x), limit) ** 2, 0.0) for x in (a, b))
+    total = np.cumsum(ea, axis=1) - np.cumsum(eb, axis=1)
+    total = np.column_stack([np.zeros(len(a)), total]) + eb.sum(axis=1, keepdims=True)
+    # As many beams as are known may come before the border, or fewer.
+    total[:, 1:] = np.where(known, total[:, 1:], np.inf)
+    least = total.min(axis=1, keepdims=True)
+    crossing = np.zeros(total.shape, dtype=bool)
+    crossing[:, 1:-1] = (np.sign(a - b)[:, 1:] != np.sign(a - b)[:, :-1]) & known[:, 1:]
+    # A crossing is believed where it explains the beams nearly as well as the best break.
+    good = crossing & (total < least + 25.0 * sigma**2)
+    best = np.where(good.any(axis=1), np.argmin(np.where(good, total, np.inf), axis=1), np.argmin(total, axis=1))
+    places = np.column_stack([order, order[:, -1] + 1])
+    behind = np.take_along_axis(order, np.maximum(count - 1, 0)[:, None], axis=1)[:, 0] + 1
+    found = np.where(best < count, np.take_along_axis(places, best[:, None], axis=1)[:, 0], behind)
+    return np.asarray(np.where(count < 2, now, found))

@@ -5,6 +5,7 @@ the sensor, which follows gentle curves. With prefix sums of the moments the bes
 costs the same small work. Breaks are found by dynamic programming over candidates, then moved to their best place.
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,8 @@ FEWEST, FEWEST_CONIC = 4, 12
 WINDOWS = (5, 10, 20, 40)
 CANDIDATE = 12.0
 """Gain in chi square of two lines over one that makes a place a candidate for a break."""
+FARTHEST = 10
+"""Beams by which a break is moved."""
 WIDEST_GAP = 3
 """Beams without return that a piece may bridge."""
 
@@ -41,9 +44,8 @@ def find_pieces(grid: BeamGrid) -> Pieces:
     gain = _break_gain(moments)
     found = []
     for row in range(len(grid.ranges)):
-        for first, last in _stretches(grid.hit[row]):
-            places = _candidates(grid, gain[:, row], row, first, last)
-            found += [(row, *piece) for piece in _divide(moments[:, row, places], places)]
+        places = [_candidates(grid, gain[:, row], row, *ends) for ends in _stretches(grid.hit[row])]
+        found += [(row, *piece) for piece in _divide(moments[:, row], places)]
     if not found:
         none = np.zeros(0, dtype=np.int64)
         return Pieces(none, none, none, np.zeros(0, dtype=bool))
@@ -67,9 +69,17 @@ def _prefix_moments(grid: BeamGrid) -> Array:
     return out
 
 
+OF_LINES = [0, 1, 2, 6, 7, 9, 10]
+"""Moments that lines need."""
+
+
 def _chi_line(d: Array) -> Array:
     """Chi square (...) of the best line by moments (11, ...)."""
-    cc, cs, ss, _, _, _, wc, ws, _, ww, number = d
+    return _chi_line_of(*d[OF_LINES])
+
+
+def _chi_line_of(cc: Array, cs: Array, ss: Array, wc: Array, ws: Array, ww: Array, number: Array) -> Array:
+    """The same by those moments that lines need."""
     determinant = cc * ss - cs * cs
     good = (number >= 2) & (determinant > 0.0)
     explained = (ss * wc * wc - 2.0 * cs * wc * ws + cc * ws * ws) / np.where(good, determinant, 1.0)
@@ -93,13 +103,15 @@ def _break_gain(moments: Array) -> Array:
     _, m, places = moments.shape
     out = np.empty((len(WINDOWS), m, places))
     at = np.arange(places)
+    of_lines = moments[OF_LINES]
     for row in range(m):
-        here = moments[:, row]
+        here = of_lines[:, row]
         for k, half in enumerate(WINDOWS):
             low, high = np.maximum(at - half, 0), np.minimum(at + half, places - 1)
             before, behind = here[:, low], here[:, high]
-            both, left, right = _chi_line(np.stack([behind - before, here - before, behind - here], axis=1))
-            enough = (here[10] - before[10] >= 3) & (behind[10] - here[10] >= 3)
+            parts = np.stack([behind - before, here - before, behind - here], axis=1)
+            both, left, right = _chi_line_of(*parts)
+            enough = (parts[6, 1] >= 3) & (parts[6, 2] >= 3)
             out[k, row] = np.where(enough, both - left - right, 0.0)
     return out
 
@@ -129,36 +141,49 @@ def _candidates(grid: BeamGrid, gain: Array, row: int, first: int, stop: int) ->
     return np.unique(np.concatenate(places))
 
 
-def _divide(moments: Array, places: IntArray) -> list[tuple[int, int, bool]]:
-    """Cheapest division of the stretch between the first and the last place (k,) into lines, conics and junk.
+def _divide(moments: Array, stretches: list[IntArray]) -> Iterator[tuple[int, int, bool]]:
+    """Cheapest division of stretches between their first and last places into lines, conics and junk.
 
-    moments : (11, k) of the beams before each place.
+    moments : (11, n + 1) of the beams before each place of the scan.  stretches : places of possible breaks of each.
     """
-    i, j = np.triu_indices(len(places), 1)
-    d = moments[:, j] - moments[:, i]
+    pairs = [np.triu_indices(len(places), 1) for places in stretches]
+    bounds = [(places[i], places[j]) for places, (i, j) in zip(stretches, pairs, strict=True)]
+    if not bounds:
+        return
+    low, high = (np.concatenate(of) for of in zip(*bounds, strict=True))
+    cost, kind = _prices(moments[:, high] - moments[:, low])
+    ends = np.cumsum([len(i) for i, _ in pairs])[:-1]
+    for places, (i, j), c, k in zip(stretches, pairs, np.split(cost, ends), np.split(kind, ends), strict=True):
+        costs, kinds = np.full((len(places), len(places)), np.inf), np.zeros((len(places), len(places)), dtype=int)
+        costs[j, i], kinds[j, i] = c, k
+        yield from _cheapest(places.tolist(), costs, kinds)
+
+
+def _prices(d: Array) -> tuple[Array, IntArray]:
+    """Least price (k,) of intervals with moments (11, k), and as what: line, conic or junk."""
     count = d[10]
     line = np.where(count >= FEWEST, _chi_line(d) + LINE_COST, np.inf)
-    conic = np.full(len(i), np.inf)
+    conic = np.full(len(count), np.inf)
     # A conic is worth a look only where it could be cheaper than the line.
     look = (count >= FEWEST_CONIC) & (line - LINE_COST > CONIC_COST - LINE_COST)
     if look.any():
         conic[look] = _chi_conic(d[:, look]) + CONIC_COST
-    junk = JUNK_COST + JUNK_BEAM * count
-    kind = np.argmin([line, conic, junk], axis=0)
-    costs = np.full((len(places), len(places)), np.inf)
-    costs[i, j] = np.min([line, conic, junk], axis=0)
-    kinds = np.zeros(costs.shape, dtype=int)
-    kinds[i, j] = kind
-    best, before = np.zeros(len(places)), np.zeros(len(places), dtype=int)
+    prices = np.stack([line, conic, JUNK_COST + JUNK_BEAM * count])
+    return prices.min(axis=0), np.argmin(prices, axis=0)
+
+
+def _cheapest(places: list[int], costs: Array, kinds: IntArray) -> list[tuple[int, int, bool]]:
+    """Pieces of the cheapest way from the first of k places to the last; costs (k, k) to a place from those before."""
+    best, before = np.zeros(len(places)), [0] * len(places)
     for k in range(1, len(places)):
-        total = best[:k] + costs[:k, k]
-        before[k] = np.argmin(total)
+        total = best[:k] + costs[k, :k]
+        before[k] = int(total.argmin())
         best[k] = total[before[k]]
     out, k = [], len(places) - 1
     while k > 0:
-        b = int(before[k])
-        if kinds[b, k] < 2:
-            out.append((int(places[b]), int(places[k]), bool(kinds[b, k] == 1)))
+        b = before[k]
+        if kinds[k, b] < 2:
+            out.append((places[b], places[k], bool(kinds[k, b] == 1)))
         k = b
     return out[::-1]
 
@@ -173,18 +198,32 @@ def _relocate(grid: BeamGrid, moments: Array, pieces: Pieces) -> Pieces:
         A, b = _normal(d[:, pieces.curved], 3)
         models[pieces.curved] = np.linalg.solve(A, b[..., None])[..., 0]
     start, stop = pieces.start.copy(), pieces.stop.copy()
-    basis = np.stack([np.cos(grid.angles), np.sin(grid.angles), np.ones(len(grid.angles))])
-    touching = (pieces.row[1:] == pieces.row[:-1]) & (pieces.start[1:] == pieces.stop[:-1])
-    for k in np.flatnonzero(touching):
-        low = max(start[k] + FEWEST, stop[k] - 10)
-        high = min(pieces.stop[k + 1] - FEWEST, pieces.start[k + 1] + 10)
-        if high <= low:
-            continue
-        span = slice(low, high)
-        r = grid.ranges[pieces.row[k], span]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            e = np.minimum(np.abs(r - 1.0 / (models[k : k + 2] @ basis[:, span])), 10.0 * grid.sigma) ** 2
-        e = np.where(np.isfinite(e), e, 0.0)
-        total = np.concatenate([[0.0], np.cumsum(e[0])]) + np.concatenate([np.cumsum(e[1][::-1])[::-1], [0.0]])
-        stop[k] = start[k + 1] = low + int(np.argmin(total))
+    touching = np.flatnonzero((pieces.row[1:] == pieces.row[:-1]) & (pieces.start[1:] == pieces.stop[:-1]))
+    # Successive breaks share a piece: every second one moves first.
+    for turn in (0, 1):
+        k = touching[touching % 2 == turn]
+        low = np.maximum(start[k] + FEWEST, stop[k] - FARTHEST)
+        high = np.minimum(stop[k + 1] - FEWEST, stop[k] + FARTHEST)
+        k, low, high = (of[high > low] for of in (k, low, high))
+        place = _best_places(grid, pieces.row[k], low, high, models[k], models[k + 1])
+        stop[k] = start[k + 1] = place
     return Pieces(pieces.row, start, stop, pieces.curved)
+
+
+def _best_places(grid: BeamGrid, row: IntArray, low: IntArray, high: IntArray, a: Array, b: Array) -> IntArray:
+    """Places (k,) from `low` to `high` (k,) before which models a, behind which models b (k, 3) fit best in sum."""
+    at = low[:, None] + np.arange(2 * FARTHEST)
+    inside = at < high[:, None]
+    at = np.minimum(at, len(grid.angles) - 1)
+    ranges, angles = grid.ranges[row[:, None], at], grid.angles[at]
+    c, s = np.cos(angles), np.sin(angles)
+    squares = []
+    for model in (a, b):
+        inverse = model[:, :1] * c + model[:, 1:2] * s + model[:, 2:]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            miss = np.minimum(np.abs(ranges - 1.0 / inverse), 10.0 * grid.sigma) ** 2
+        squares.append(np.where(inside & np.isfinite(miss), miss, 0.0))
+    total = np.zeros((len(row), at.shape[1] + 1))
+    total[:, 1:] = np.cumsum(squares[0] - squares[1], axis=1)
+    total[:, 1:][~inside] = np.inf
+    return np.asarray(low + np.argmin(total, axis=1))

@@ -1,6 +1,6 @@
 """Which degrees and knots a height field gets: as many as the data pay for."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
@@ -9,13 +9,11 @@ import numpy as np
 
 from bsmap_cli.core.bspline import design_matrix
 from bsmap_cli.fit.blocks import Blocks
+from bsmap_cli.fit.feet import Feet, find_feet, tabulate
 from bsmap_cli.fit.heights import (
     Base,
-    Feet,
     HeightField,
     Knots,
-    evaluate,
-    find_feet,
     least_knots,
     with_degree,
     with_knot,
@@ -30,6 +28,12 @@ SMOOTH = 0.3
 """Metres: second differences of the heights are of this size or less. Only where there are no data does it matter."""
 ROBUST = 3.0
 """Standard deviations beyond which a block counts less (Huber)."""
+LEAST_BLOCKS = 4.0
+"""Of each control point: what needs more than that is not smooth."""
+MOST_STEPS = 40
+"""Of one search."""
+SETTLED = 1e-5
+"""Metres of change of the heights below which a fit about its own result is not repeated."""
 MOST = 400
 """Control points of one face."""
 
@@ -43,10 +47,10 @@ class Fitted(NamedTuple):
 
 
 class _Data(NamedTuple):
-    """Feet (n,) of the blocks, heights wanted there, roots of the weights.
+    """Feet (n,) of the blocks; heights wanted there and roots of the weights, standard deviations.
 
     places : along s and t, number of distinct parameters, to a thousandth.
-    bases : basis functions at the feet that were computed so far, by direction, degree and knots.
+    bases : basis functions at the feet that were computed so far, by direction, degree and knots; along s times `root`.
     """
 
     feet: Feet
@@ -56,54 +60,81 @@ class _Data(NamedTuple):
     bases: dict[tuple[int, int, bytes], Array]
 
     def basis(self, axis: int, degree: int, knots: Array) -> Array:
-        """(n, k) basis functions along s (0) or t (1)."""
+        """(n, k) basis functions along s (0), weighted, or t (1)."""
         key = axis, degree, knots.tobytes()
         if key not in self.bases:
-            self.bases[key] = design_matrix(knots, degree, np.clip(self.feet.uv[:, axis], 0.0, 1.0))
+            values = design_matrix(knots, degree, np.clip(self.feet.uv[:, axis], 0.0, 1.0))
+            self.bases[key] = values if axis else values * self.root[:, None]
         return self.bases[key]
 
 
-class _Trial(NamedTuple):
-    """A fit with the chi square (n,) of each block."""
+class _Solution(NamedTuple):
+    """Heights (k,) on knots with their information (k, k), chi square and criterion."""
 
-    fitted: Fitted
-    misfit: Array
+    knots: Knots
+    heights: Array
+    information: Array
+    chi_square: float
+
+    @property
+    def criterion(self) -> float:
+        return self.chi_square + PRICE * self.knots.size
+
+    def on(self, field: HeightField) -> HeightField:
+        """The field with these knots and heights."""
+        return replace(field, knots=self.knots, heights=self.heights.reshape(self.knots.shape))
+
+    def fitted(self, field: HeightField) -> Fitted:
+        """The field with these heights, and what is known of them."""
+        return Fitted(self.on(field), self.information, self.criterion)
 
 
 def fit_heights(blocks: Blocks, base: Base, low: Array, high: Array, sigma: float) -> Fitted:
     """Fit with the degrees and knots of the best criterion, found step by step from the least surface."""
     knots = least_knots(base)
     field = HeightField(base, low, high, knots, np.zeros(knots.shape))
-    best = _solve(field, field.knots, _linearise(field, blocks, sigma)).fitted
-    data = _linearise(best.field, blocks, sigma)
-    trial = _solve(best.field, field.knots, data)
-    for _ in range(40):
-        better = _improve(trial, data)
-        if better is None:
-            break
-        data = _linearise(better, blocks, sigma)
-        trial = _solve(better, better.knots, data)
-    return refit(trial.fitted.field, blocks, sigma)
+    data = _linearise(field, blocks, sigma)
+    best = _solve(knots, data)
+    # First roughly; pairs of steps are tried about the surface that this gives.
+    for kinds in ((_single_steps,), (_single_steps, _double_steps)):
+        best = _climb(best, data, kinds)
+        field = best.on(field)
+        data = _linearise(field, blocks, sigma, data)
+        best = _solve(best.knots, data)
+    return _settled(best.on(field), blocks, sigma, data)
 
 
 def refit(field: HeightField, blocks: Blocks, sigma: float) -> Fitted:
     """Fit on the degrees and knots that a field has."""
+    return _settled(field, blocks, sigma, None)
+
+
+def _settled(field: HeightField, blocks: Blocks, sigma: float, data: _Data | None) -> Fitted:
+    """Fit on a field's knots, repeated about its own result; data: about one near it."""
     for _ in range(2):
-        best = _solve(field, field.knots, _linearise(field, blocks, sigma)).fitted
-        field = best.field
-    return best
+        data = _linearise(field, blocks, sigma, data)
+        best = _solve(field.knots, data)
+        change = np.abs(best.heights - field.heights.ravel()).max()
+        field = best.on(field)
+        if change < SETTLED:
+            break
+    return best.fitted(field)
 
 
-def _linearise(field: HeightField, blocks: Blocks, sigma: float) -> _Data:
-    feet = find_feet(field, blocks.points, blocks.directions)
-    wanted = evaluate(field, feet.uv)[0] - feet.slope * feet.beyond
+def _linearise(field: HeightField, blocks: Blocks, sigma: float, near: _Data | None = None) -> _Data:
+    """Linear equations about a field's own feet; near: those of one near it."""
+    only = np.zeros(len(blocks.counts), dtype=np.int64)
+    start = None if near is None else near.feet.beyond
+    feet = find_feet(tabulate([field]), only, blocks.points, blocks.directions, start)
+    wanted = feet.height - feet.slope * feet.beyond
     root = np.sqrt(blocks.counts) / sigma
     size = np.abs(feet.beyond) * root
     # What does not fit yet is no outlier: the scale is that of the residuals.
     scale = max(1.0, float(np.median(size)) / 0.6745)
     robust = np.sqrt(np.minimum(1.0, ROBUST * scale / np.maximum(size, 1e-12)))
+    root = root * robust / np.abs(feet.slope)
     places = _places(feet.uv[:, 0]), _places(feet.uv[:, 1])
-    return _Data(feet, wanted, root * robust / np.abs(feet.slope), places, {})
+    return _Data(feet, wanted * root, root, places, {})
 
 
 def _places(u: Array) -> int:
@@ -111,20 +142,23 @@ def _places(u: Array) -> int:
     return int(np.count_nonzero(np.bincount(np.rint(np.clip(u, 0.0, 1.0) * 1000.0).astype(np.int64))))
 
 
-def _solve(field: HeightField, knots: Knots, data: _Data) -> _Trial:
+def _rows(knots: Knots, data: _Data) -> Array:
+    """(n, k) products of the basis functions, weighted."""
+    along_s, along_t = data.basis(0, knots.degree_s, knots.s), data.basis(1, knots.degree_t, knots.t)
+    return (along_s[:, :, None] * along_t[:, None, :]).reshape(len(along_s), -1)
+
+
+def _solve(knots: Knots, data: _Data) -> _Solution:
     """Least squares on given knots."""
-    along_s = data.basis(0, knots.degree_s, knots.s) * data.root[:, None]
-    along_t = data.basis(1, knots.degree_t, knots.t)
-    N = (along_s[:, :, None] * along_t[:, None, :]).reshape(len(along_s), -1)
-    y = data.wanted * data.root
-    A = N.T @ N + smoothness(knots)
-    scale = 1.0 / np.sqrt(A.diagonal())
-    scaled = A * scale[:, None] * scale
+    N, y = _rows(knots, data), data.wanted
+    A, b = N.T @ N, N.T @ y
+    information = A + smoothness(knots)
+    scale = 1.0 / np.sqrt(information.diagonal())
+    scaled = information * scale[:, None] * scale
     scaled.flat[:: len(A) + 1] += 1e-12
-    heights = scale * np.linalg.solve(scaled, scale * (N.T @ y))
-    misfit = (N @ heights - y) ** 2
-    field = replace(field, knots=knots, heights=heights.reshape(knots.shape))
-    return _Trial(Fitted(field, A, float(misfit.sum()) + PRICE * knots.size), misfit)
+    heights = scale * np.linalg.solve(scaled, scale * b)
+    residuals = N @ heights - y
+    return _Solution(knots, heights, information, float(residuals @ residuals))
 
 
 def smoothness(knots: Knots) -> Array:
@@ -146,52 +180,85 @@ def _second(n: int) -> Array:
     return np.diff(np.eye(n), 2, axis=0) if n > 2 else np.zeros((1, n))
 
 
-def _improve(best: _Trial, data: _Data) -> HeightField | None:
-    """The best next step, or where none pays the best pair of steps; None where no pair pays, either."""
-    singles = [_solve(best.fitted.field, knots, data) for knots in _moves(best, data)]
-    first = min((one.fitted for one in singles), key=lambda f: f.criterion, default=best.fitted)
-    if first.criterion < best.fitted.criterion:
-        return first.field
-    tried: set[bytes] = set()
-    second = best.fitted
-    for one in singles:
-        for knots in _moves(one, data):
-            key = bytes((knots.degree_s, knots.degree_t)) + knots.s.tobytes() + knots.t.tobytes()
-            if key not in tried:
-                tried.add(key)
-                second = min(second, _solve(one.fitted.field, knots, data).fitted, key=lambda f: f.criterion)
-    return second.field if second is not best.fitted else None
+_Steps = Callable[[Knots, _Data, Array], Iterator[Knots]]
 
 
-def _moves(trial: _Trial, data: _Data) -> Iterator[Knots]:
+def _climb(best: _Solution, data: _Data, kinds: Sequence[_Steps]) -> _Solution:
+    """The solution to which the best steps lead while they pay; those of later kinds only where no earlier one does."""
+    for _ in range(MOST_STEPS):
+        misfit = (_rows(best.knots, data) @ best.heights - data.wanted) ** 2
+        for steps in kinds:
+            found = [_solve(knots, data) for knots in steps(best.knots, data, misfit)]
+            first = min(found, key=lambda one: one.criterion, default=best)
+            if first.criterion < best.criterion:
+                best = first
+                break
+        else:
+            break
+    return best
+
+
+def _single_steps(knots: Knots, data: _Data, misfit: Array) -> Iterator[Knots]:
     """Knots with a higher degree along s or t, or with the span of most excess halved."""
-    k = trial.fitted.field.knots
-    if k.size > MOST:
-        return
-    uv = np.clip(data.feet.uv, 0.0, 1.0)
-    # Only where the data stand at more places than there will be control points along this direction.
-    if data.places[0] > k.shape[0] + 1:
-        if k.degree_s < HIGHEST_DEGREE:
-            yield k._replace(degree_s=k.degree_s + 1, s=with_degree(k.s, k.degree_s))
-        place = _worst_span(k.s, uv[:, 0], trial.misfit)
-        if place is not None:
-            yield k._replace(s=with_knot(k.s, k.degree_s, place))
-    if data.places[1] > k.shape[1] + 1:
-        if k.degree_t < HIGHEST_DEGREE:
-            yield k._replace(degree_t=k.degree_t + 1, t=with_degree(k.t, k.degree_t))
-        place = _worst_span(k.t, uv[:, 1], trial.misfit)
-        if place is not None:
-            yield k._replace(t=with_knot(k.t, k.degree_t, place))
+    for axis in (0, 1):
+        old = _along(knots, axis)
+        if _room(knots, data, axis, 1):
+            for new in (_raised(old), _halved(old, data, axis, misfit)):
+                if new is not None:
+                    yield _with(knots, axis, new)
 
 
-def _worst_span(knots: Array, u: Array, misfit: Array) -> float | None:
-    """Middle of the span with most chi square over its share, if both halves have data."""
-    breaks = np.unique(knots)
+def _double_steps(knots: Knots, data: _Data, misfit: Array) -> Iterator[Knots]:
+    """The same twice along s, or twice along t: across each other two steps that do not pay hardly ever do."""
+    for axis in (0, 1):
+        old = _along(knots, axis)
+        if not _room(knots, data, axis, 2):
+            continue
+        raised, halved = _raised(old), _halved(old, data, axis, misfit)
+        for one, both in ((raised, _raised), (halved, _raised)):
+            if one is not None and (new := both(one)) is not None:
+                yield _with(knots, axis, new)
+        if halved is not None and (new := _halved(halved, data, axis, misfit)) is not None:
+            yield _with(knots, axis, new)
+
+
+class _Line(NamedTuple):
+    """Degree and knots along one direction."""
+
+    degree: int
+    knots: Array
+
+
+def _along(knots: Knots, axis: int) -> _Line:
+    return _Line(knots.degree_t, knots.t) if axis else _Line(knots.degree_s, knots.s)
+
+
+def _with(knots: Knots, axis: int, line: _Line) -> Knots:
+    """Knots with others along one direction."""
+    if axis:
+        return knots._replace(degree_t=line.degree, t=line.knots)
+    return knots._replace(degree_s=line.degree, s=line.knots)
+
+
+def _room(knots: Knots, data: _Data, axis: int, steps: int) -> bool:
+    """Whether the data stand at more places than there will be control points along a direction, and are enough."""
+    more = knots.size * (knots.shape[axis] + steps) / knots.shape[axis]
+    return more <= min(MOST, len(data.root) / LEAST_BLOCKS) and data.places[axis] > knots.shape[axis] + steps
+
+
+def _raised(line: _Line) -> _Line | None:
+    """A degree more, up to the highest."""
+    return _Line(line.degree + 1, with_degree(line.knots, line.degree)) if line.degree < HIGHEST_DEGREE else None
+
+
+def _halved(line: _Line, data: _Data, axis: int, misfit: Array) -> _Line | None:
+    """The span with most chi square (n,) over its share halved, if both halves have data."""
+    breaks, u = np.unique(line.knots), np.clip(data.feet.uv[:, axis], 0.0, 1.0)
     span = np.clip(np.searchsorted(breaks, u, side="right") - 1, 0, len(breaks) - 2)
     total = np.bincount(span, misfit - 1.0, len(breaks) - 1)
     worst = int(np.argmax(total))
-    middle = (breaks[worst] + breaks[worst + 1]) / 2.0
+    middle = float(breaks[worst] + breaks[worst + 1]) / 2.0
     inside = u[span == worst]
     if _places(inside) < 4 or not (inside < middle).any() or not (inside > middle).any():
         return None
-    return float(middle)
+    return _Line(line.degree, with_knot(line.knots, line.degree, middle))

@@ -12,7 +12,8 @@ from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.crossings import Crossings, find_crossings
 from bsmap_cli.fit.division import Faces
 from bsmap_cli.fit.ends import doubtful_cells, find_ends, on_faces, passed_through, within_ends
-from bsmap_cli.fit.heights import Feet, HeightField
+from bsmap_cli.fit.feet import Feet, tabulate
+from bsmap_cli.fit.heights import HeightField
 from bsmap_cli.fit.labels import feet_of
 from bsmap_cli.fit.outline import outline
 from bsmap_cli.model import Array, IntArray, TrimLoop
@@ -41,11 +42,11 @@ def trim(grid: BeamGrid, faces: Faces, feet: Sequence[Feet]) -> Trims:
     """Outlines of all faces, with few vertices, and creases stored once; feet of the beams of each face."""
     fields = [fitted.field for fitted in faces.fitted]
     crossings = find_crossings(grid, faces.labels, fields)
-    ends = find_ends(grid, faces.labels, crossings)
+    ends, table = find_ends(grid, faces.labels, crossings), tabulate(fields)
     clean = on_faces(grid, faces.labels, feet)
-    doubtful = doubtful_cells(clean, faces.labels, fields, crossings, ends)
-    crossings = within_ends(clean, faces.labels, fields, crossings, ends)
-    crossings = passed_through(clean, faces.labels, fields, crossings, ends)
+    doubtful = doubtful_cells(clean, faces.labels, table, crossings, ends)
+    crossings = within_ends(clean, faces.labels, table, crossings, ends)
+    crossings = passed_through(clean, faces.labels, table, crossings, ends)
     believed = ~(doubtful | beyond_bare_ends(clean, faces.labels, fields, ends))
     creases: dict[tuple[int, ...], int] = {}
     lines: list[CreaseLine] = []

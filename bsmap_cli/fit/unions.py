@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bsmap_cli.fit.blocks import Blocks
+from bsmap_cli.fit.blocks import Blocks, thinned
 from bsmap_cli.fit.context import PRICE, Context
 from bsmap_cli.fit.lowmodels import (
     ORDERS,
@@ -52,7 +52,7 @@ def unite_regions(context: Context, regions: list[list[int]]) -> list[list[int]]
 
 
 def _region(context: Context, members: Sequence[int]) -> _Region:
-    blocks = context.blocks_of(members)
+    blocks = thinned(context.blocks_of(members))
     frame = fit_plane_frame(blocks)
     box = np.array([blocks.points.min(axis=0), blocks.points.max(axis=0)])
     cost, is_round = low_order_cost(blocks, frame, context.sigma)

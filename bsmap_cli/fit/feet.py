@@ -1,0 +1,228 @@
+"""Where beams meet height fields, those of many faces at once: a call costs the same for one face and for fifty."""
+
+import itertools
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from bsmap_cli.core.pieces import CHUNK, Spans, horner
+from bsmap_cli.fit.heights import CylinderBase, HeightField
+from bsmap_cli.model import Array, IntArray
+
+SETTLED = 1e-4
+"""Metres; behind a step of Newton's method below this what is left is its square times the curvature."""
+STEEPEST = 0.05
+"""Smallest sine between beam and surface that counts."""
+FARTHEST = 5.0
+"""Metres that a step of Newton's method may go."""
+
+
+class Feet(NamedTuple):
+    """Where beams meet height fields.
+
+    uv : (n, 2) parameters, not clamped.  beyond : (n,) metres from the measured point on to the foot, along the beam.
+    slope : (n,) change of height over the surface along the beam.  points : (n, 3) in map.  height : (n,) metres.
+    """
+
+    uv: Array
+    beyond: Array
+    slope: Array
+    points: Array
+    height: Array
+
+
+class Lines(NamedTuple):
+    """Spans along one direction of f faces, face after face: where each begins, two more for each face; its middle, and
+    the change (k,) of its own parameter.  first, spans : (f,) number of the first span of each face, and how many.
+    """
+
+    begins: Array
+    middles: Array
+    scales: Array
+    first: IntArray
+    spans: IntArray
+
+
+class Table(NamedTuple):
+    """Height fields of f faces.
+
+    frame : (12, f) axes s, t, normal and origin; of a cylinder, x, y, z and its centre on the ground.
+    radius, middle : (f,) of cylinders; radius 0 for planes.  low, size : (2, f) of the rectangles, metres.
+    least, most : (f,) parameters beyond which a surface goes on straight.  lines : along s and t.
+    orders : (2, f) of the coefficients along t and s.
+    coefficients : (4, 4, pieces) Taylor coefficients about the middles, those of t outside.  first_piece : (f,).
+    """
+
+    frame: Array
+    radius: Array
+    middle: Array
+    low: Array
+    size: Array
+    least: Array
+    most: Array
+    lines: tuple[Lines, Lines]
+    orders: IntArray
+    coefficients: Array
+    first_piece: IntArray
+
+
+def tabulate(fields: Sequence[HeightField]) -> Table:
+    """Table of height fields, in their order."""
+    frame, radius, middle = np.empty((12, len(fields))), np.zeros(len(fields)), np.zeros(len(fields))
+    for k, field in enumerate(fields):
+        base = field.base
+        if isinstance(base, CylinderBase):
+            frame[:9, k], frame[9:, k] = np.eye(3).ravel(), (*base.centre, 0.0)
+            radius[k], middle[k] = base.radius, base.middle
+        else:
+            frame[:9, k], frame[9:, k] = base.axes.T.ravel(), base.origin
+    low, high = (np.array([getattr(field, end) for field in fields]).reshape(-1, 2).T for end in ("low", "high"))
+    # The least surface's formula holds beyond its rectangle, too.
+    endless = np.array([field.knots.shape == (2, 2) for field in fields], dtype=bool)
+    least, most = np.where(endless, -np.inf, 0.0), np.where(endless, np.inf, 1.0)
+    pieces = [field.pieces for field in fields]
+    along_s, along_t = _joined([p.along_u for p in pieces]), _joined([p.along_v for p in pieces])
+    orders = np.array([p.coefficients.shape[:2] for p in pieces], dtype=np.int64).reshape(-1, 2).T
+    total = along_s.spans * along_t.spans
+    first = np.cumsum(total) - total
+    coefficients = np.zeros((*orders.max(axis=1, initial=2), int(total.sum())))
+    for p, start, count in zip(pieces, first, total, strict=True):
+        q, r = p.coefficients.shape[:2]
+        coefficients[:q, :r, start : start + count] = p.coefficients[:, :, 0]
+    return Table(frame, radius, middle, low, high - low, least, most, (along_s, along_t), orders, coefficients, first)
+
+
+def _joined(spans: Sequence[Spans]) -> Lines:
+    """Spans along one direction of all faces."""
+    none = np.zeros(0)
+    count = np.array([len(of.middle) for of in spans], dtype=np.int64)
+    begins = np.concatenate([none, *(np.append(0.0, of.inner[:-1]) + 2.0 * k for k, of in enumerate(spans))])
+    middles, scales = (np.concatenate([none, *of]) for of in ([s.middle for s in spans], [s.scale for s in spans]))
+    return Lines(begins, middles, scales, np.cumsum(count) - count, count)
+
+
+def find_feet(
+    table: Table, face: IntArray, points: Array, directions: Array, start: Array | None = None, steps: int = 4
+) -> Feet:
+    """Feet of beams through points (n, 3) along unit directions (n, 3), each on its face (n,), by Newton's method.
+
+    start : (n,) metres from the points at which it begins, 0 where not given.
+    """
+    uv, rest = np.empty((2, len(points))), np.empty((3, len(points)))
+    for part, faces in _chunks(face):
+        p, d = np.ascontiguousarray(points[part].T), np.ascontiguousarray(directions[part].T)
+        begin = np.zeros(p.shape[1]) if start is None else start[part]
+        uv[:, part], rest[:, part] = _newton(table, faces, p, d, begin, steps)
+    beyond, slope, height = rest
+    return Feet(uv.T, beyond, slope, points + beyond[:, None] * directions, height)
+
+
+def _chunks(face: IntArray) -> Iterator[tuple[slice | IntArray, IntArray]]:
+    """Parts of the beams on faces (n,) that fit into the processor's cache, with their faces.
+
+    Long lists are taken face by face: where a part has only one face, that is given once, and its tables need not be
+    copied for every beam.
+    """
+    if len(face) <= CHUNK:
+        yield slice(None), face
+        return
+    order = np.argsort(face.astype(np.int32), kind="stable")
+    ordered = face[order]
+    for a, b in itertools.pairwise([0, *(np.flatnonzero(np.diff(ordered)) + 1).tolist(), len(face)]):
+        for first in range(a, b, CHUNK):
+            yield order[first : min(first + CHUNK, b)], ordered[a : a + 1]
+
+
+def offsets(table: Table, face: IntArray, points: Array) -> tuple[Array, Array]:
+    """Heights (n,) of points (n, 3) above their faces, to first order their distances, and unit normals (n, 3)."""
+    frame, p = table.frame.take(face, axis=1), np.ascontiguousarray(points.T)
+    local = _turned(frame, p - frame[9:])
+    at, arm = _round_ones(table, face, len(points))
+    if len(at):
+        local[:, at], c, s = _around(table, face[at], p[:, at] - frame[9:, at])
+    height, gradient, _ = _heights(table, face, local)
+    normal = frame[6:9] - gradient[0] * frame[0:3] - gradient[1] * frame[3:6]
+    if len(at):
+        around = gradient[0, at] * arm / np.maximum(arm + local[2, at], 0.1 * arm)
+        normal[:, at] = c + around * s, s - around * c, -gradient[1, at]
+    length = np.sqrt(np.sum(normal**2, axis=0))
+    return (local[2] - height) / length, (normal / length).T
+
+
+def _newton(table: Table, face: IntArray, p: Array, d: Array, start: Array, steps: int) -> tuple[Array, Array]:
+    """(2, n) parameters; (3, n) way beyond the points, slope and height, of beams p, d (3, n)."""
+    frame = table.frame.take(face, axis=1)
+    # Over a plane s, t and h change evenly along a beam.
+    flat, turn = _turned(frame, p - frame[9:]), _turned(frame, d)
+    at, arm = _round_ones(table, face, p.shape[1])
+    every = np.broadcast_to(face, p.shape[1])
+    centre = np.broadcast_to(frame[9:], p.shape)[:, at]
+    beyond = start.copy()
+    for step in range(steps):
+        local = flat + beyond * turn
+        if len(at):
+            local[:, at], c, s = _around(table, every[at], p[:, at] + beyond[at] * d[:, at] - centre)
+            stretch = arm / np.maximum(arm + local[2, at], 0.1 * arm)
+            dx, dy, dz = d[:, at]
+            turn[:, at] = (dy * c - dx * s) * stretch, dz, dx * c + dy * s
+        height, gradient, uv = _heights(table, face, local)
+        climb = gradient[0] * turn[0] + gradient[1] * turn[1]
+        slope = turn[2] - climb
+        slope = np.where(np.abs(slope) < STEEPEST, np.where(slope < 0.0, -STEEPEST, STEEPEST), slope)
+        move = np.clip((local[2] - height) / slope, -FARTHEST, FARTHEST)
+        beyond -= move
+        if step == steps - 1 or np.abs(move).max(initial=0.0) < SETTLED:
+            break
+    uv -= move * turn[:2] / table.size.take(face, axis=1)
+    return uv, np.stack([beyond, slope, height - move * climb])
+
+
+def _turned(frame: Array, vectors: Array) -> Array:
+    """(3, n) vectors (3, n), each in its frame (12, n)."""
+    x, y, z = vectors
+    return np.stack([frame[k] * x + frame[k + 1] * y + frame[k + 2] * z for k in (0, 3, 6)])
+
+
+def _round_ones(table: Table, face: IntArray, count: int) -> tuple[IntArray, Array]:
+    """Which of the faces (count,), or (1,) for all, are cylinders, and their radii."""
+    if not table.radius.any():
+        return np.zeros(0, dtype=np.int64), np.zeros(0)
+    radius = np.broadcast_to(table.radius.take(face), count)
+    at = np.flatnonzero(radius)
+    return at, radius[at]
+
+
+def _around(table: Table, face: IntArray, place: Array) -> tuple[Array, Array, Array]:
+    """(3, n) arc, height, distance outwards, on cylinders, of places (3, n) about their axes; cosine and sine."""
+    radius, (x, y, z) = table.radius[face], place
+    angle = (np.arctan2(y, x) - table.middle[face] + np.pi) % (2.0 * np.pi) - np.pi
+    distance = np.hypot(x, y)
+    safe = np.maximum(distance, 1e-12)
+    return np.stack([angle * radius, z, distance - radius]), x / safe, y / safe
+
+
+def _heights(table: Table, face: IntArray, local: Array) -> tuple[Array, Array, Array]:
+    """Heights (n,) at s, t of `local` (3, n), gradients (2, n) by s and t, and parameters (2, n)."""
+    size = table.size.take(face, axis=1)
+    uv = (local[:2] - table.low.take(face, axis=1)) / size
+    inside = np.clip(uv, table.least.take(face), table.most.take(face))
+    number, x, scale = zip(
+        *(_own_parameter(line, face, u) for line, u in zip(table.lines, inside, strict=True)), strict=True
+    )
+    piece = table.first_piece.take(face) + number[0] * table.lines[1].spans.take(face) + number[1]
+    orders_t, orders_s = table.orders.take(face, axis=1).max(axis=1, initial=2).tolist()
+    value, by_x, by_y = horner(table.coefficients[:orders_t, :orders_s].take(piece, axis=2), *x)
+    gradient = np.stack([by_x * scale[0], by_y * scale[1]])
+    height = value + gradient[0] * (uv[0] - inside[0]) + gradient[1] * (uv[1] - inside[1])
+    return height, gradient / size, uv
+
+
+def _own_parameter(line: Lines, face: IntArray, u: Array) -> tuple[IntArray, Array, Array]:
+    """Number (n,) of the span of each parameter (n,) in its face, the span's own parameter, and its change."""
+    number, first = np.zeros(len(u), dtype=np.int64), line.first.take(face)
+    if len(face) != 1 or line.spans[face[0]] > 1:
+        number = line.begins.searchsorted(np.clip(u, 0.0, 1.0) + 2.0 * face, side="right") - 1 - first
+    span = number + first
+    scale = line.scales.take(span)
+    return number, (u - line.middles.take(span)) * scale, scale

@@ -74,7 +74,9 @@ def spacing(grid, labels):
         other = np.s_[i:, max(0, k) : labels.shape[1] - max(0, -k)]
         step = np.linalg.norm(grid.points[other] - grid.points[own], axis=2)
         step = np.where((labels[own] == labels[other]) & (labels[own] >= 0) & np.isfinite(step), step, 0.0)
-        out[own], out[other] = np.maximum(out[own], step), np.maximum(out[other], step)
+        # One after the other: the two overlap.
+        out[own] = np.maximum(out[own], step)
+        out[other] = np.maximum(out[other], step)
     return out
 
 

@@ -12,7 +12,16 @@ from bsmap_cli.fit.blocks import Blocks, make_blocks, thinned
 from bsmap_cli.fit.clutter import find_planes
 from bsmap_cli.fit.crossings import find_crossings
 from bsmap_cli.fit.heights import Base, CylinderBase, HeightField, PlaneBase, plane_base
-from bsmap_cli.fit.labels import adopt, fill, find_misses, move_breaks, runs_of, without_alike, without_outliers
+from bsmap_cli.fit.labels import (
+    adopt,
+    fill,
+    find_misses,
+    move_breaks,
+    runs_of,
+    without_alike,
+    without_outliers,
+    without_slipped_ends,
+)
 from bsmap_cli.fit.lowmodels import fit_cylinder_frame, fit_plane_frame
 from bsmap_cli.fit.pieces import find_pieces
 from bsmap_cli.fit.regions import find_regions
@@ -60,7 +69,9 @@ def find_faces(grid: BeamGrid) -> Faces:
         misses = find_misses(grid, labels, fields)
         divided = adopt(grid, without_outliers(misses, sigma), fields, sigma)
         divided = move_breaks(grid, divided, fields, sigma)
-        divided = without_alike(grid, find_misses(grid, divided, fields, misses), sigma)
+        misses = find_misses(grid, divided, fields, misses)
+        misses = misses._replace(labels=without_alike(grid, misses, sigma))
+        divided = without_slipped_ends(grid, misses, fields, sigma)
         if step < ROUNDS - 1:
             divided = find_planes(grid, divided, sigma, rng)
             labels, fitted = _fit_changed(grid, labels, divided, fitted, sigma)

@@ -14,6 +14,8 @@ from bsmap_cli.model import Array, IntArray
 
 OUTLIER, ADOPTED = 4.5, 3.5
 """Standard deviations beyond which a beam leaves its face, within which one of the rest joins a neighbouring face."""
+SLIPPED = 2.0
+"""The same for the last beam before a jump that misses its face towards the next one."""
 ALIKE = ((3, 3), (7, 1))
 """Scans and beams of neighbourhoods whose misses are added up."""
 NEXT = ((-1, 0), (1, 0), (0, -2), (0, -1), (0, 1), (0, 2))
@@ -67,7 +69,10 @@ def feet_of_faces(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField
 
 
 class Misses(NamedTuple):
-    """Labels (m, n), and metres (m, n) from the point on to the beam's face, along the beam; 0 for beams without."""
+    """Labels (m, n), and metres (m, n) from the point on to the beam's face, along the beam.
+
+    0 for beams without face; infinite for those that only graze it, and may pass it.
+    """
 
     labels: IntArray
     beyond: Array
@@ -80,7 +85,8 @@ def find_misses(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField],
     if known is not None:
         new &= labels != known.labels
     row, column = np.nonzero(new)
-    beyond[row, column] = feet_at(grid, tabulate(fields), labels[row, column], row, column).beyond
+    feet = feet_at(grid, tabulate(fields), labels[row, column], row, column)
+    beyond[row, column] = np.where(np.abs(feet.slope) > STEEPEST, feet.beyond, np.inf)
     return Misses(labels, beyond)
 
 
@@ -104,6 +110,30 @@ def without_alike(grid: BeamGrid, misses: Misses, sigma: float) -> IntArray:
         total, count = _window_sums(own, miss, window)
         alike |= member & (np.abs(total) > OUTLIER * np.sqrt(count)) & (miss * total > 0.0)
     return np.where(alike, -1, labels)
+
+
+def without_slipped_ends(grid: BeamGrid, misses: Misses, fields: Sequence[HeightField], sigma: float) -> IntArray:
+    """Labels without those last beams of runs that are on their way to where the scan goes on beyond a jump.
+
+    A beam at the edge of a jump may have hit what lies between (the side of a recess, a wall of which only one scan
+    tells): then it misses its face on the side on which the next beam does, and neither face behind it fits.
+    """
+    labels, table = misses.labels.copy(), tabulate(fields)
+    for step in (-1, 1):
+        row, column = np.nonzero((labels >= 0) & (np.abs(misses.beyond) > SLIPPED * sigma) & grid.hit)
+        following = column + step
+        inside = (following >= 0) & (following < labels.shape[1])
+        row, column, following = row[inside], column[inside], following[inside]
+        face, other = misses.labels[row, column], misses.labels[row, following]
+        ends = (other != face) & grid.hit[row, following]
+        row, column, following, face, other = (of[ends] for of in (row, column, following, face, other))
+        own, next_one = misses.beyond[row, column], feet_at(grid, table, face, row, following).beyond
+        gone = (own * next_one > 0.0) & (np.abs(next_one) > np.abs(own))
+        meets = np.flatnonzero(gone & (other >= 0))
+        to_other = feet_at(grid, table, other[meets], row[meets], column[meets]).beyond
+        gone[meets] = np.abs(to_other) > OUTLIER * sigma
+        labels[row[gone], column[gone]] = -1
+    return labels
 
 
 def _window_sums(own: IntArray, values: Array, window: tuple[int, int]) -> tuple[Array, Array]:

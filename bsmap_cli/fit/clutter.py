@@ -15,6 +15,8 @@ FEWEST, FEWEST_SCANS = 16, 3
 """Beams and scans of a plane."""
 SAMPLES = 80
 """Triples tried for each plane."""
+TRIED = 10
+"""Planes of the sample that are looked at, those with the most beams."""
 PLANES = 8
 """Tried for in one connected patch of the rest."""
 WITHIN = 3.0
@@ -55,7 +57,17 @@ def _best_plane(grid: BeamGrid, rest: IntArray, sigma: float, rng: np.random.Gen
     sine = normals @ directions.T
     miss = np.abs(offsets[:, None] - normals @ points.T) / np.maximum(np.abs(sine), INCIDENCE)
     inside = (miss < WITHIN * sigma) & (np.abs(sine) > INCIDENCE)
-    mask = _connected(rest, inside[int(np.argmax(inside.sum(axis=1)))])
+    # Beams all over a large patch lie in one plane by chance: those in one piece count.
+    best = np.argsort(-inside.sum(axis=1), kind="stable")[:TRIED]
+    masks = sorted((_connected(rest, inside[k]) for k in best), key=lambda mask: -int(mask.sum()))
+    planes = (_settled_plane(points, directions, rest, mask, sigma) for mask in masks)
+    return next((mask for mask in planes if mask is not None), None)
+
+
+def _settled_plane(
+    points: Array, directions: Array, rest: IntArray, mask: NDArray[np.bool_], sigma: float
+) -> NDArray[np.bool_] | None:
+    """Which of the beams (k, 2) lie on the plane through those of a mask (k,); None where these are no plane."""
     for _ in range(2):
         if mask.sum() < FEWEST:
             return None

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bsmap_cli.fit.beams import BeamGrid
+from bsmap_cli.fit.context import FLATNESS
 from bsmap_cli.fit.feet import STEEPEST, Feet, Table, find_feet, tabulate
 from bsmap_cli.fit.heights import HeightField
 from bsmap_cli.model import Array, IntArray
@@ -15,7 +16,7 @@ from bsmap_cli.model import Array, IntArray
 OUTLIER, ADOPTED = 4.5, 3.5
 """Standard deviations beyond which a beam leaves its face, within which one of the rest joins a neighbouring face."""
 SLIPPED = 2.0
-"""The same for the last beam before a jump that misses its face towards the next one."""
+"""The same, of noise and flatness together, for the last beam before a jump that misses its face towards the next."""
 ALIKE = ((3, 3), (7, 1))
 """Scans and beams of neighbourhoods whose misses are added up."""
 NEXT = ((-1, 0), (1, 0), (0, -2), (0, -1), (0, 1), (0, 2))
@@ -120,7 +121,9 @@ def without_slipped_ends(grid: BeamGrid, misses: Misses, fields: Sequence[Height
     """
     labels, table = misses.labels.copy(), tabulate(fields)
     for step in (-1, 1):
-        row, column = np.nonzero((labels >= 0) & (np.abs(misses.beyond) > SLIPPED * sigma) & grid.hit)
+        row, column = np.nonzero(
+            (labels >= 0) & (np.abs(misses.beyond) > SLIPPED * np.hypot(sigma, FLATNESS)) & grid.hit
+        )
         following = column + step
         inside = (following >= 0) & (following < labels.shape[1])
         row, column, following = row[inside], column[inside], following[inside]

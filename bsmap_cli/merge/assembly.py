@@ -12,6 +12,7 @@ from bsmap_cli.merge.curves import FacePair
 from bsmap_cli.merge.extent import trimmed
 from bsmap_cli.merge.frames import Frame
 from bsmap_cli.merge.information import Joined, Told, covariance_of
+from bsmap_cli.merge.open_borders import fewer_vertices
 from bsmap_cli.merge.outlines import creased_sides, member_of, outline, snapped
 from bsmap_cli.merge.shapes import Shape, spline_shape
 from bsmap_cli.merge.topology import Topology, find_topology
@@ -63,8 +64,10 @@ def assemble(
     outlines |= {number: members[number][0].corners for number in range(len(groups), len(surfaces))}
     sides = creased_sides(member for some in members for member in some)
     found = find_topology(outlines, sides, shapes, gap)
-    simple = {number: untangled(rings, shapes[number]) for number, rings in found.rings.items()}
-    made = [trimmed(whole[number], rings, shapes[number]) for number, rings in simple.items()]
+    made = []
+    for number, rings in found.rings.items():
+        simple = untangled(fewer_vertices(rings, shapes[number]), shapes[number])
+        made.append(trimmed(whole[number], simple, shapes[number]))
     return made, _creases(found, names), found.corners
 
 

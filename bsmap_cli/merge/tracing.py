@@ -9,9 +9,9 @@ from bsmap_cli.merge.curves import APART, BESIDE, Curve, FacePair, Shapes, locat
 from bsmap_cli.merge.shapes import Shape, SplineShape, above, flattened
 from bsmap_cli.model import Array
 
-FINE = 0.02
+FINE = 0.01
 """Metres between points of a curve before it is simplified."""
-TOLERANCE = 0.0005
+TOLERANCE = 0.001
 """Metres by which a simplified curve may leave the crossing of its surfaces."""
 ON = 0.002
 """Metres off a surface within which a point of a curve is on it: where surfaces touch, they hardly cross."""

@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, multivariate_normal
 
-from bsmap_cli.core.gaussian import chi2_gate, pack, product, squared_distance, symmetric_sqrt, unpack
+from bsmap_cli.core.gaussian import (
+    chi2_gate,
+    pack,
+    product,
+    rounded_root,
+    squared_distance,
+    symmetric_sqrt,
+    unpack,
+)
 from bsmap_cli.core.noise import FLOOR, range_sigma
 from bsmap_cli.errors import BsmapError
 
@@ -103,3 +111,30 @@ def test_range_sigma_does_not_see_edges():
     rng = np.random.default_rng(1)
     ranges = np.repeat(rng.uniform(1, 9, (100, 20)), 18, axis=1) + 0.01 * rng.normal(size=(100, 360))
     assert range_sigma(ranges) == pytest.approx(0.01, rel=0.2)
+
+
+def test_rounded_root_gives_the_covariance_back_and_is_its_own_root():
+    rng, unit = np.random.default_rng(0), 1e-8
+    for _ in range(50):
+        F = np.tril(rng.normal(size=(8, 8))) * np.exp(rng.uniform(-10.0, -5.0, 8)) + 1e-5 * np.eye(8)
+        C = F @ F.T
+        L = rounded_root(C, unit, 20.0)
+        if L is None:
+            continue
+        assert np.array_equal(L, np.tril(np.rint(L)))
+        deviations = np.sqrt(np.diag(C))
+        assert np.all(np.abs(L @ L.T * unit**2 - C) <= 2.0 * unit * np.maximum(deviations[:, None], deviations))
+        np.testing.assert_array_equal(rounded_root(L @ L.T * unit**2, unit, 20.0), L)
+
+
+def test_rounded_root_keeps_what_is_small_between_large_deviations():
+    """Corners that are hardly known, a middle that is: its variance is a small difference of large numbers."""
+    common = 0.002 * np.array([1.0, -1.0, 1.0, -1.0])
+    C = np.outer(common, common) + 3e-5**2 * np.eye(4)
+    L, middle = rounded_root(C, 1e-8, 200.0) * 1e-8, np.full(4, 0.25)
+    assert middle @ (L @ L.T) @ middle == pytest.approx(middle @ C @ middle, rel=0.02)
+
+
+def test_nearly_singular_covariance_has_no_rounded_root():
+    F = np.random.default_rng(1).normal(size=(6, 2)) * 1e-3
+    assert rounded_root(F @ F.T, 1e-8, 200.0) is None

@@ -39,6 +39,24 @@ def symmetric_sqrt(matrices: Array) -> Array:
     return np.einsum("...ik,...k,...jk->...ij", vectors, roots, vectors)
 
 
+def rounded_root(covariance: Array, unit: float, least: float) -> Array | None:
+    """Lower triangular root L (n, n), in whole units, of a covariance (n, n); None where it is nearly singular.
+
+    Cholesky's method, each column rounded before the next ones are found, so that these make up for it. The root of
+    L L' is L. What is left of a variance, given those before it, is to be `least` units squared or more.
+    """
+    left = np.rint(covariance / unit**2)
+    root = np.zeros_like(left)
+    for k in range(len(left)):
+        pivot = np.rint(np.sqrt(max(left[k, k], 0.0)))
+        if pivot < least:
+            return None
+        root[k, k] = pivot
+        root[k + 1 :, k] = np.rint(left[k + 1 :, k] / pivot)
+        left -= np.outer(root[:, k], root[:, k])
+    return root
+
+
 def squared_distance(difference: Array, covariance: Array) -> Array:
     """Squared Mahalanobis distances (...,) of differences (..., k) under covariances (..., k, k)."""
     try:

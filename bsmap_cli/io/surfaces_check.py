@@ -27,6 +27,8 @@ BLOCK_TOLERANCE = 1e-3
 CORRELATION_TOLERANCE = 1e-4
 HEIGHT_TOLERANCE = 1e-6
 OUTCOMES = ("merged", "refused", "moved")
+ROOT_UNIT = 1e-8
+"""Metres of which roots of heights' covariances are whole multiples."""
 MOVEMENTS = ("translation", "rotation", "unorganised")
 
 
@@ -169,6 +171,10 @@ def _heights(plain: dict[str, Any], nu: int, nv: int, poses: dict[str, PosePart]
     if np.any(np.abs(np.linalg.norm(directions, axis=2) - 1.0) > 1e-6):
         raise MalformedError(f"{where}: directions are not of length 1")
     n = nu * nv
+    if "root" in plain:
+        root = np.zeros((n, n))
+        root.T[np.triu_indices(n)] = _array(plain, "root", (n * (n + 1) // 2,), where) * ROOT_UNIT
+        return HeightCovariance(directions, root @ root.T, _pose(plain, poses, where))
     matrix = _symmetric(_array(plain, "matrix", (n * (n + 1) // 2,), where), n)
     eigenvalues = np.linalg.eigvalsh(matrix)
     if eigenvalues[0] < -HEIGHT_TOLERANCE * abs(eigenvalues[-1]):

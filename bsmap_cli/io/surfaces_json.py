@@ -24,7 +24,9 @@
         "correlation_u", "correlation_v":   upper triangles row by row, nu (nu + 1) / 2 and nv (nv + 1) / 2 numbers
         or, of control points that move along given directions only,
         "directions":          nu or 1 x nv or 1 x 3 unit vectors
-        "matrix":              upper triangle row by row of the heights' covariance, n (n + 1) / 2 numbers, n = nu nv
+        "root":                lower triangle L column by column, n (n + 1) / 2 integers, n = nu nv: the heights'
+                               covariance is L L', in units of 1e-8 m; or, of one that is nearly singular,
+        "matrix":              its upper triangle row by row, in square metres
         and "pose": [{"data_set", "weight"}, ...]},
      "trims": [{"parameters": k x 2, u and v of a closed polygon,
                 "creases": k numbers of the creases along the sides from each vertex to the next, -1 for none}, ...]
@@ -32,9 +34,9 @@
      "residuals": {"points", "mean", "rms", "percentile_95", "maximum"}}
 
 model/surfaces.py tells what each is. Numbers are rounded to what they are worth, for the bytes of a map matter:
-coordinates and correlations to 1e-6, knots to 1e-10, creases, corners and parameters of trims to 1e-5, covariances to
-4 (those of heights, which are differences of large numbers, to 7) and residuals to 6 significant digits. A map that was
-read is written again byte for byte.
+coordinates, correlations and weights to 1e-6, directions to 1e-7, knots to 1e-10, creases, corners and parameters of
+trims to 1e-5, covariances to 4 (those of heights that are nearly singular to
+7) and residuals to 6 significant digits. A map that was read is written again byte for byte.
 """
 
 import gzip
@@ -45,10 +47,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from bsmap_cli.core.gaussian import rounded_root
 from bsmap_cli.errors import BadInputError, MissingInputError
 from bsmap_cli.io.artifact import Provenance, atomic_output, plain_json
-from bsmap_cli.io.surfaces_check import MalformedError, parse_map
+from bsmap_cli.io.surfaces_check import ROOT_UNIT, MalformedError, parse_map
 from bsmap_cli.model import (
     Array,
     BSplineSurface,
@@ -63,6 +67,8 @@ from bsmap_cli.model import (
 
 FORMAT = "bsmap-surfaces"
 VERSION = 5
+LEAST_ROOT = 200.0
+"""Units that the diagonal of a root has at least, so that rounding changes no variance by a percent."""
 
 
 def write_surfaces(path: Path | str, surfaces: SurfaceMap, provenance: Provenance | None = None) -> None:
@@ -137,16 +143,28 @@ def _crease(crease: Crease) -> dict[str, Any]:
 def _covariance(covariance: SurfaceCovariance | HeightCovariance) -> dict[str, Any]:
     if isinstance(covariance, HeightCovariance):
         return {
-            "directions": _rounded(covariance.directions, 9),
-            "matrix": _significant(_upper(covariance.matrix), 7),
-            "pose": [{"data_set": part.data_set, "weight": float(part.weight)} for part in covariance.pose],
+            "directions": _rounded(covariance.directions, 7),
+            **_heights(covariance.matrix),
+            "pose": _shares(covariance),
         }
     return {
         "blocks": _significant(covariance.blocks, 4),
         "correlation_u": _rounded(_upper(covariance.correlation_u), 6),
         "correlation_v": _rounded(_upper(covariance.correlation_v), 6),
-        "pose": [{"data_set": part.data_set, "weight": float(part.weight)} for part in covariance.pose],
+        "pose": _shares(covariance),
     }
+
+
+def _heights(matrix: Array) -> dict[str, Any]:
+    """Covariance of heights by its root, which needs fewer digits: what is small is no difference of what is large."""
+    root = rounded_root(matrix, ROOT_UNIT, LEAST_ROOT)
+    if root is None:
+        return {"matrix": _significant(_upper(matrix), 7)}
+    return {"root": _upper(root.T).astype(int).tolist()}
+
+
+def _shares(covariance: SurfaceCovariance | HeightCovariance) -> list[dict[str, Any]]:
+    return [{"data_set": part.data_set, "weight": _rounded(part.weight, 6)} for part in covariance.pose]
 
 
 def _poses(surfaces: SurfaceMap) -> list[PosePart]:
@@ -180,11 +198,11 @@ def _placement(placement: Placement) -> dict[str, Any]:
 
 
 def _upper(matrix: Array) -> Array:
-    """Upper triangle of a symmetric matrix, row by row."""
+    """Upper triangle of a matrix, row by row."""
     return np.asarray(matrix)[np.triu_indices(len(matrix))]
 
 
-def _rounded(values: Array, decimals: int) -> Any:
+def _rounded(values: ArrayLike, decimals: int) -> Any:
     return (np.round(np.asarray(values, dtype=float), decimals) + 0.0).tolist()  # + 0.0 turns -0.0 into 0.0
 
 

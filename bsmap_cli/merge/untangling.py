@@ -78,7 +78,7 @@ def _crossings(flat: Sequence[Array]) -> IntArray:
 
 
 def _without_crossing(rings: Sequence[Ring], flat: Sequence[Array], crossings: IntArray) -> tuple[int, int] | None:
-    """Ring and vertex without which the fewest crossings are left, by the least area; None where all leave as many."""
+    """Ring and vertex without which the fewest crossings are left, by the least area; None where none helps."""
     best, least = None, (len(crossings), 0.0)
     tried = {(r, (v + step) % len(flat[r])) for r, v in crossings.reshape(-1, 2).tolist() for step in (0, 1)}
     for ring, vertex in sorted(tried):

@@ -177,6 +177,9 @@ def plane_base(points: Array, normal: Array) -> PlaneBase:
 def basis_matrix(knots: Knots, uv: Array) -> Array:
     """(n, ns * nt) products of the basis functions at parameters (n, 2), clamped to [0, 1]."""
     inside = np.clip(uv, 0.0, 1.0)
+    if knots.size == 4:
+        u, v = inside.T
+        return _columns((1.0 - u) * (1.0 - v), (1.0 - u) * v, u * (1.0 - v), u * v)
     along_s = design_matrix(knots.s, knots.degree_s, inside[:, 0])
     along_t = design_matrix(knots.t, knots.degree_t, inside[:, 1])
     return (along_s[:, :, None] * along_t[:, None, :]).reshape(len(uv), -1)

@@ -11,6 +11,8 @@ from bsmap_cli.model import Array
 
 SETTLED = 1e-9
 """Metres; a step below this is the last one."""
+PARALLEL = 0.1
+"""Of singular values of the surfaces' normals, the smallest over the largest, below which they count as parallel."""
 FARTHEST = 0.05
 """Metres by which a point is moved onto surfaces at most."""
 APART = 0.02
@@ -46,13 +48,29 @@ def onto(shapes: Sequence[Shape], points: Array, farthest: float = FARTHEST) -> 
         found = [above(shape, out) for shape in shapes]
         heights = np.stack([h for h, _ in found], axis=1)
         normals = np.stack([n for _, n in found], axis=1)
-        # Surfaces that are nearly parallel do not tell where along them they meet.
-        steps = np.linalg.pinv(normals, rcond=0.1) @ heights[..., None]
-        out = out - steps[..., 0]
+        steps = _steps(normals, heights)
+        out = out - steps
         if np.abs(steps).max(initial=0.0) < SETTLED:
             break
     far = np.linalg.norm(out - points, axis=1) > farthest
     return np.where(far[:, None], points, out)
+
+
+def _steps(normals: Array, heights: Array) -> Array:
+    """(n, 3) shortest ways along unit normals (n, k, 3) that change all heights (n, k).
+
+    Surfaces that are nearly parallel do not tell where along them they meet.
+    """
+    if normals.shape[1] != 2:
+        return np.asarray((np.linalg.pinv(normals, rcond=PARALLEL) @ heights[..., None])[..., 0])
+    # Of two the singular values are the roots of 1 + c and 1 - c, of the sum and the difference of the normals.
+    (a, b), (g, h) = normals.transpose(1, 0, 2), heights.T
+    c = np.sum(a * b, axis=1)
+    plus, minus = 1.0 + c, 1.0 - c
+    least = PARALLEL**2 * np.maximum(plus, minus)
+    by_sum = np.divide(g + h, 2.0 * plus, out=np.zeros(len(c)), where=plus > least)
+    by_difference = np.divide(g - h, 2.0 * minus, out=np.zeros(len(c)), where=minus > least)
+    return np.asarray((by_sum + by_difference)[:, None] * a + (by_sum - by_difference)[:, None] * b)
 
 
 def union(intervals: Array, gap: float) -> Array:

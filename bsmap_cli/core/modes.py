@@ -6,6 +6,8 @@ from bsmap_cli.model import Array
 
 MOST_MODES = 12
 """Told of a trajectory at most."""
+LEAST_SHARE = 0.01
+"""Of the sum of variances, that a mode must have to be told."""
 LEVER = 3.0
 """Metres at which an error of heading counts as one of position, for the choice of modes: where points are seen."""
 

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from bsmap_cli.core.modes import LEVER, MOST_MODES, largest_positive
+from bsmap_cli.core.modes import LEAST_SHARE, LEVER, MOST_MODES, largest_positive
 from bsmap_cli.model import Array, BSplineSurface, DataSet, PosePart
 
 NEAR = 1.0
@@ -110,9 +110,10 @@ def _summed_parts(
 
 
 def with_common_modes(sums: Mapping[str, Sum]) -> dict[str, PosePart]:
-    """Pose parts, the modes of all trajectories made those of one; what MOST_MODES do not hold becomes their own.
+    """Pose parts, the modes of all trajectories made those of one; what the largest of them do not hold becomes their
+    own, as it does of a single trajectory.
 
-    The name of the one follows from theirs, and is as short.
+    The name of the one follows from what it holds.
     """
     counts = {trajectory: M.shape[1] for one in sums.values() for trajectory, M in one.modes.items()}
     if not counts:
@@ -123,8 +124,9 @@ def with_common_modes(sums: Mapping[str, Sum]) -> dict[str, PosePart]:
     ]
     scale = np.tile([1.0, 1.0, LEVER], len(columns))[:, None]
     U, s, _ = np.linalg.svd(scale * np.concatenate(columns), full_matrices=False)
-    modes = largest_positive(U[:, :MOST_MODES] * s[:MOST_MODES]) / scale
-    trajectory = hashlib.sha256(" ".join(sorted(counts)).encode()).hexdigest()[:8]
+    told = (s**2 > LEAST_SHARE * np.sum(s**2)) & (np.arange(len(s)) < MOST_MODES)
+    modes = largest_positive(U[:, told] * s[told]) / scale
+    trajectory = hashlib.sha256(modes.tobytes()).hexdigest()[:8]
     return {
         name: replace(one.part, modes=modes[3 * k : 3 * k + 3], trajectory=trajectory)
         for k, (name, one) in enumerate(sums.items())

@@ -8,7 +8,7 @@ from scipy import sparse
 from scipy.linalg import eigh
 from scipy.sparse.linalg import SuperLU
 
-from bsmap_cli.core.modes import LEVER, MOST_MODES, largest_positive
+from bsmap_cli.core.modes import LEAST_SHARE, LEVER, MOST_MODES, largest_positive
 from bsmap_cli.model import Array, IntArray
 from bsmap_cli.slam.posegraph import factorise
 
@@ -16,8 +16,6 @@ MOST_POSES = 300
 """Poses solved for exactly; those between them are interpolated, for neighbours err alike."""
 COLUMNS = 120
 """Columns solved for at once."""
-LEAST_SHARE = 0.01
-"""Of the sum of variances, that a mode must have to be told."""
 
 
 class Marginals(NamedTuple):

@@ -1,11 +1,14 @@
 """SLAM that holds on real logs: tracking, loops, lines, smoothing; the default of `run_slam`."""
 
+import logging
+
 import numpy as np
 
 from bsmap_cli.core import se2
 from bsmap_cli.core.table import joined, take
 from bsmap_cli.model import Array, IntArray, LineMap, LoopClosures, ScanLog, SlamMap, StepStatistics, Trajectory
 from bsmap_cli.params import SlamParams
+from bsmap_cli.slam.latency import lined_up, odometry_delay
 from bsmap_cli.slam.lines import MappedLines, map_lines
 from bsmap_cli.slam.loops import Closures, close_loops, is_loop
 from bsmap_cli.slam.marginals import Marginals, marginals
@@ -17,6 +20,8 @@ from bsmap_cli.slam.tracking import MATCH_FLOOR, Tracking, limited, track_scans
 from bsmap_cli.slam.upkeep import with_positive_offset
 from bsmap_cli.track import Track
 
+logger = logging.getLogger("bsmap")
+
 NO_ODOMETRY = np.array([0.1, 0.1, 0.05])
 ODOMETRY_FLOOR = np.array([0.003, 0.003, 0.002])
 """Metres and radians by which a step between key scans may be off: as it was tracked, and by odometry at the least."""
@@ -27,7 +32,7 @@ of a step's allows for what neighbours have in common."""
 
 def run_graph(log: ScanLog, range_sigma: float, params: SlamParams, track: Track) -> SlamMap:
     """Trajectory and line map by matching, loop closing, the line filter and smoothing of all of it."""
-    tracking = track_scans(log, range_sigma, params, track)
+    log, tracking = _tracked(log, range_sigma, params, track)
     closures = close_loops(tracking, range_sigma, track)
     segments = _key_segments(log, tracking.keys, range_sigma, params)
     mapped = map_lines(closures.poses, segments, params)
@@ -49,6 +54,20 @@ def run_graph(log: ScanLog, range_sigma: float, params: SlamParams, track: Track
         _loops(closures, tracking),
         tracking.poses,
     )
+
+
+def _tracked(log: ScanLog, range_sigma: float, params: SlamParams, track: Track) -> tuple[ScanLog, Tracking]:
+    """The scans tracked, once more with odometry and laser lined up where their stamps turn out to disagree."""
+    tracking = track_scans(log, range_sigma, params, track)
+    if log.odometry is None:
+        return log, tracking
+    delay = odometry_delay(log.horizontal.time_ns, tracking.poses, log.odometry, tracking.matched)
+    if delay == 0.0:
+        return log, tracking
+    way = "behind" if delay > 0 else "ahead of"
+    logger.warning("stamps of the horizontal laser are %.2f s %s those of the odometry; lined up", abs(delay), way)
+    log = lined_up(log, delay)
+    return log, track_scans(log, range_sigma, params, track)
 
 
 def _key_segments(log: ScanLog, keys: IntArray, range_sigma: float, params: SlamParams) -> Segments:

@@ -43,7 +43,7 @@ class Tracking(NamedTuple):
     points : of each key scan, in base_link.  edges : from each key scan but the first to an earlier one.
     match_information : (k - 1, 3, 3), what the match alone says of each edge.
     weak : (k,) key scans whose match failed, so that their edge holds no more than the motion prior.
-    odometry_scale : metres of way for a metre of odometry.
+    odometry_scale : metres of way for a metre of odometry.  matched : (n,) scans that a good match placed.
     """
 
     poses: Array
@@ -53,6 +53,7 @@ class Tracking(NamedTuple):
     match_information: Array
     weak: NDArray[np.bool_]
     odometry_scale: float
+    matched: NDArray[np.bool_]
 
 
 def track_scans(log: ScanLog, range_sigma: float, params: SlamParams, track: Track) -> Tracking:
@@ -60,7 +61,7 @@ def track_scans(log: ScanLog, range_sigma: float, params: SlamParams, track: Tra
     n = len(log.horizontal.time_ns)
     poses = np.zeros((n, 3))
     keys, key_points, information, by_match, inliers = [0], [], [], [], [1.0]
-    last, before, scale = 0, 0, OdometryScale()
+    last, before, scale, matched = 0, 0, OdometryScale(), np.zeros(n, bool)
     noise = match_noise(range_sigma)
     scans = _points_of_scans(log, range_sigma)
     key_points.append(next(scans))
@@ -74,7 +75,7 @@ def track_scans(log: ScanLog, range_sigma: float, params: SlamParams, track: Tra
         if log.odometry is not None and not _moved(prior.increment, params.match_distance, params.match_angle):
             continue
         found = _match(points, target, predicted, prior, noise)
-        poses[k] = found.pose
+        poses[k], matched[k] = found.pose, found.inliers >= GOOD
         before, last = last, k
         step = se2.between(poses[keys[-1]], poses[k])
         if not _moved(step, params.key_distance, params.key_angle):
@@ -90,7 +91,8 @@ def track_scans(log: ScanLog, range_sigma: float, params: SlamParams, track: Tra
         target = make_target(joined([placed[j - len(keys)] for j in _local(inliers)]))
     chain = _chain(poses[keys], information, np.array(inliers))
     match_information = np.array(by_match).reshape(-1, 3, 3)
-    return Tracking(poses, np.array(keys), key_points, chain, match_information, np.array(inliers) < WEAK, scale.value)
+    weak = np.array(inliers) < WEAK
+    return Tracking(poses, np.array(keys), key_points, chain, match_information, weak, scale.value, matched)
 
 
 def _local(inliers: list[float]) -> list[int]:

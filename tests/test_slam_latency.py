@@ -31,16 +31,18 @@ def test_stamps_that_agree_have_no_delay():
     assert odometry_delay(*winding(0.0), np.ones(400, bool)) == 0.0
 
 
-@pytest.mark.parametrize("case", ["few", "straight", "stamps step back", "nothing alike"])
+@pytest.mark.parametrize("case", ["few", "straight", "stamps step back", "nothing alike", "scans far apart"])
 def test_nothing_is_told_where_nothing_can_be(case):
     time_ns, poses, odometry = winding(0.2)
     matched = np.ones(400, bool)
     if case == "few":
-        matched[50:] = False
+        matched[100:] = False
     elif case == "straight":
         poses, odometry = poses * [1, 1, 0], odometry * [1, 1, 0]
     elif case == "stamps step back":
         time_ns[200] = time_ns[198]
+    elif case == "scans far apart":
+        time_ns = 10 * time_ns
     else:
         poses = np.random.default_rng(1).normal(size=poses.shape)
     assert odometry_delay(time_ns, poses, odometry, matched) == 0.0

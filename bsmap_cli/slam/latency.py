@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 from bsmap_cli.core import se2
 from bsmap_cli.model import Array, IntArray, ScanLog
 
-MOST_DELAY, STEP = 0.5, 0.01
-"""Seconds, to both sides, and between those tried."""
-FEWEST = 50
+LEAST_DELAY, MOST_DELAY, STEP = 0.03, 0.5, 0.01
+"""Seconds, to both sides: shorter ones do no harm, and scans farther apart tell nothing; and between those tried."""
+FEWEST = 100
 """Turns between matched scans without which nothing is told."""
 LARGEST_TURN = 0.5
 """Radians: what goes beyond may be a slip or a false match and counts as this much."""
-CLEAR = 0.5
+CLEAR = 0.75
 """Share of the turns' disagreement that may be left when the stamps are lined up, for a delay to be believed."""
 
 
@@ -30,7 +30,8 @@ def odometry_delay(time_ns: IntArray, poses: Array, odometry: Array, matched: ND
     seconds = (time_ns - time_ns[0]) * 1e-9
     # What the odometry told before the first scan and after the last one is not known.
     scans = np.flatnonzero(matched & (seconds >= MOST_DELAY) & (seconds <= seconds[-1] - MOST_DELAY))
-    if len(scans) <= FEWEST or np.any(np.diff(time_ns) <= 0):
+    between = np.diff(seconds)
+    if len(scans) <= FEWEST or between.min() <= 0.0 or np.median(between) > MOST_DELAY:
         return 0.0
     heading = np.unwrap(odometry[:, 2])
     seen = _turns(np.unwrap(poses[:, 2])[scans])
@@ -41,7 +42,8 @@ def odometry_delay(time_ns: IntArray, poses: Array, odometry: Array, matched: ND
         return 0.0
     apart = 1.0 - np.array([np.corrcoef(seen, turns)[0, 1] for turns in told]) ** 2
     best = int(np.argmin(apart))
-    return float(delays[best]) if apart[best] < CLEAR * apart[steps] else 0.0
+    clear = apart[best] < CLEAR * apart[steps] and abs(best - steps) * STEP >= LEAST_DELAY
+    return float(delays[best]) if clear else 0.0
 
 
 def _turns(heading: Array) -> Array:

@@ -8,7 +8,7 @@ from bsmap_cli.evaluate import distance_to_mesh
 from bsmap_cli.fit.beams import make_grid
 from bsmap_cli.fit.division import find_faces
 from bsmap_cli.fit.heights import CylinderBase, PlaneBase, basis_matrix, evaluate, least_knots
-from bsmap_cli.fit.labels import feet_of_faces, find_misses, without_alike
+from bsmap_cli.fit.labels import feet_of_faces, find_misses, without_alike, without_slipped_ends
 
 SIGMA = 0.03
 SEEDS = (0, 3, 5)
@@ -63,6 +63,42 @@ def test_beams_that_miss_a_face_together_leave_it():
     labels = without_alike(grid, find_misses(grid, faces.labels, fields), faces.sigma)
     assert np.all(labels[row - 1 : row + 2, column - 1 : column + 2] == -1)
     assert np.count_nonzero(labels != faces.labels) < 40
+
+
+def test_last_beam_that_misses_its_face_towards_the_jump_behind_it_leaves_it():
+    grid = make_grid(corridor_set(0.01).cloud, np.arange(20))
+    faces = find_faces(grid)
+    fields = [f.field for f in faces.fitted]
+    feet = feet_of_faces(grid, faces.labels, fields)
+    points = grid.points.copy()
+    for number, of_face in enumerate(feet):
+        points[(faces.labels == number) & grid.hit] = of_face.points
+    wall = faces.labels == np.argmax(np.bincount(faces.labels[faces.labels >= 0]))
+    row, column = (int(k[len(k) // 2]) for k in np.nonzero(wall))
+    # What lies behind the beam of half a metre more, in front of it, is a jump.
+    points[row, column + 1] -= 0.5 * grid.directions[row, column + 1]
+    labels = faces.labels.copy()
+    labels[row, column + 1] = -1
+    for miss, leaves in ((0.03, True), (-0.03, False), (0.01, False)):
+        points[row, column] -= miss * grid.directions[row, column]
+        moved = grid._replace(points=points)
+        after = without_slipped_ends(moved, find_misses(moved, labels, fields), fields, faces.sigma)
+        assert (after[row, column] == -1) == leaves
+        points[row, column] += miss * grid.directions[row, column]
+        assert np.count_nonzero(after != labels) == leaves
+
+
+def test_beam_that_only_grazes_a_face_misses_it():
+    grid = make_grid(corridor_set(0.01).cloud, np.arange(20))
+    faces = find_faces(grid)
+    normal = faces.fitted[0].field.base.axes[:, 2]
+    row, column = (int(k[len(k) // 2]) for k in np.nonzero(faces.labels == 0))
+    directions = grid.directions.copy()
+    along = directions[row, column] - (directions[row, column] @ normal) * normal
+    directions[row, column] = along / np.linalg.norm(along)
+    misses = find_misses(grid._replace(directions=directions), faces.labels, [f.field for f in faces.fitted])
+    assert np.isinf(misses.beyond[row, column])
+    assert np.count_nonzero(np.isinf(misses.beyond)) == 1
 
 
 def test_least_surface_over_a_cylinder_bears_an_error_of_its_centre():

@@ -51,6 +51,13 @@ def test_corridor_needs_few_control_points_and_leaves_few_beams():
     assert figures["range_sigma"] == pytest.approx(0.01, rel=0.05)
 
 
+def test_room_leaves_few_beams_those_of_walls_that_two_scans_tell_of_among_the_faces():
+    _, surface_map = room()
+    kinds = {data_set.name: data_set.movement for data_set in surface_map.data_sets}
+    for name, figures in surface_map.notes["fit"].items():
+        assert figures["in_faces"] > {"translation": 0.998, "rotation": 0.985}[kinds[name]] * figures["beams"]
+
+
 def test_both_faces_of_a_crease_run_along_it():
     """The sides of the loops that refer to a crease lie on its points, to the rounding of the surfaces' meeting."""
     from bsmap_cli.core.bspline import evaluate_surface

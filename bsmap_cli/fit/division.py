@@ -25,6 +25,7 @@ from bsmap_cli.fit.labels import (
 from bsmap_cli.fit.lowmodels import fit_cylinder_frame, fit_plane_frame
 from bsmap_cli.fit.pieces import find_pieces
 from bsmap_cli.fit.regions import find_regions
+from bsmap_cli.fit.seeds import PAIR_BEAMS
 from bsmap_cli.fit.selection import Fitted, fit_heights, refit
 from bsmap_cli.fit.unions import low_order_cost
 from bsmap_cli.model import Array, IntArray
@@ -124,7 +125,7 @@ def _kept(labels: IntArray, grid: BeamGrid) -> tuple[IntArray, IntArray]:
     number = int(labels.max(initial=-1)) + 1
     beams = np.bincount(labels[grid.hit & (labels >= 0)], minlength=number)
     scans = np.array([np.count_nonzero(np.any((labels == k) & grid.hit, axis=1)) for k in range(number)], dtype=int)
-    kept = np.flatnonzero((beams >= FEWEST_BEAMS) & (scans >= 3))
+    kept = np.flatnonzero(((beams >= FEWEST_BEAMS) & (scans >= 3)) | ((beams >= 2 * PAIR_BEAMS) & (scans == 2)))
     new = np.full(number + 1, -1)
     new[kept] = np.arange(len(kept))
     return new[labels], kept

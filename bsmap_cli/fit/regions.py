@@ -15,7 +15,7 @@ from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.context import PRICE, Context, make_context
 from bsmap_cli.fit.lowmodels import ORDERS, Frame, PlaneFrame, Sums, chi_squares, sums_of_rows, weighted_rows
 from bsmap_cli.fit.pieces import Pieces
-from bsmap_cli.fit.seeds import bent_seeds, cylinder_seeds, plane_seeds
+from bsmap_cli.fit.seeds import bent_seeds, cylinder_seeds, pairs, plane_seeds
 from bsmap_cli.fit.unions import unite_regions
 from bsmap_cli.model import IntArray
 
@@ -35,6 +35,9 @@ def find_regions(grid: BeamGrid, pieces: Pieces) -> tuple[list[list[int]], float
             grown = _grow(context, owner, seed, frame)
             owner[grown] = len(regions)
             regions.append(grown)
+    for pair in pairs(context, owner):
+        owner[pair] = len(regions)
+        regions.append(pair)
     return unite_regions(context, regions), context.sigma
 
 

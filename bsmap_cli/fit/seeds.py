@@ -12,6 +12,10 @@ from bsmap_cli.model import Array, IntArray
 SEED_INCIDENCE = 0.15
 """Sine between beams and the surface of a seed; flatter ones bridge jumps."""
 
+PAIR_BEAMS, PAIR_OVERLAP, PAIR_INCIDENCE = 20, 0.8, 0.5
+"""Of a face that only two scans tell of: beams in each, share of the longer piece before beams of the other, sine of
+incidence. Two scan lines nearly always fit a plane: long ones that end together, seen steeply, are believed."""
+
 Seed = tuple[list[int], Frame]
 
 
@@ -73,6 +77,25 @@ def cylinder_seeds(context: Context, owner: IntArray) -> Iterator[Seed]:
             frame = fit_cylinder_frame(blocks)
             if frame is not None and joint_excess(context, chain, sums_of(frame, blocks, context.sigma), 3) < 0.0:
                 yield chain, frame
+                break
+
+
+def pairs(context: Context, owner: IntArray) -> Iterator[list[int]]:
+    """Free pieces of two successive scans that lie in a plane which no third scan sees."""
+    start, stop, row = context.pieces.start, context.pieces.stop, context.pieces.row
+    for first in np.flatnonzero((owner < 0) & (context.beams >= PAIR_BEAMS) & ~context.pieces.curved).tolist():
+        for second in context.neighbours[first]:
+            common = min(stop[first], stop[second]) - max(start[first], start[second])
+            longer = max(stop[first] - start[first], stop[second] - start[second])
+            free = owner[first] < 0 and owner[second] < 0 and row[second] == row[first] + 1
+            if not free or context.beams[second] < PAIR_BEAMS or common < PAIR_OVERLAP * longer:
+                continue
+            pair = [first, second]
+            blocks = context.blocks_of(pair)
+            frame = fit_plane_frame(blocks, _rough_normal(context, pair))
+            sums = sums_of(frame, blocks, context.sigma)
+            if _incidence(frame, blocks) > PAIR_INCIDENCE and joint_excess(context, pair, sums, 3) < 0.0:
+                yield pair
                 break
 
 

@@ -17,6 +17,9 @@ LEAST_AREA = 4e-4
 ALONG = 0.001
 """Metres from a crease within which the border of a gap runs along it."""
 
+ALONG_CREASES = 0.4
+"""Of the border of a gap, how much runs along creases where a wall stands in it: one of its long sides is enough."""
+
 NO_SIDES = np.zeros((0, 2, 2))
 
 Region = Any  # shapely's types are not known to the type checker
@@ -36,7 +39,7 @@ def united(regions: Sequence[Region], gap: float, creases: Array = NO_SIDES) -> 
     """Union of the regions of several data sets, gaps between them that are narrower than `gap` closed.
 
     What lies inside the outline of a single region is no gap: a hole that one data set saw stays open. Nor is what lies
-    between creases: there stands a thin wall.
+    along creases: there stands a thin wall.
 
     creases : (k, 2, 2) sides of the regions along creases.
     """
@@ -64,7 +67,7 @@ def parts(region: Region) -> list[Region]:
 
 
 def _between(part: Region, creases: Region) -> bool:
-    return bool(shapely.intersection(part.boundary, creases).length > part.length / 2.0)
+    return bool(shapely.intersection(part.boundary, creases).length > ALONG_CREASES * part.length)
 
 
 def _touched(part: Region, regions: Sequence[Region]) -> int:

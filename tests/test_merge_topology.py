@@ -183,6 +183,17 @@ def test_edge_between_two_scans_is_found_where_both_walls_come_to_it(short, crea
     assert whole_mesh(result).is_watertight == (short < 0.1)
 
 
+@pytest.mark.parametrize(("short", "creases"), [((0.07, 0.02), 12), ((0.02, 0.07), 12), ((0.07, 0.06), 11)])
+def test_edge_that_nobody_saw_is_found_where_both_walls_together_come_within_the_gap(short, creases):
+    whole = boxed("a", LOW, HIGH)
+    names = {"a/south": short[0], "a/west": short[1]}
+    lost = next(k for k, crease in enumerate(whole.creases) if set(crease.surfaces) == set(names))
+    faces = tuple(narrowed(s, names[s.name], lost) if s.name in names else s for s in whole.surfaces)
+    result = merged(SurfaceMap(faces, whole.data_sets, creases=whole.creases))
+    assert len(result.creases) == creases
+    assert whole_mesh(result).is_watertight
+
+
 def test_walls_that_hardly_bend_meet_between_their_corners():
     """Two walls at six degrees, the second one seen from 3 cm on: no data set saw their edge."""
     first = plate("a/1", (0, 0, 0), (2, 0, 0), (0, 0, 2.5), (2, 1.5), (0, -1, 1, -1))
@@ -266,11 +277,12 @@ def test_crease_at_a_bent_wall_is_one_curve_on_both_faces(names, directions):
     assert len(a - far) > len(x)
 
 
+@pytest.mark.parametrize("seen", [2, 1])
 @pytest.mark.parametrize("thickness", [0.04, 0.2])
-def test_thin_wall_stands_in_a_gap_of_the_floor_that_is_not_closed(thickness):
-    """One data set on each side of it; the floor is one plane."""
+def test_thin_wall_stands_in_a_gap_of_the_floor_that_is_not_closed(thickness, seen):
+    """One data set on each side of it; the floor is one plane. Both saw where it stands on it, or only one did."""
     sides = []
-    for name, start, end, mark in (("a", 2.0, 0.0, 0), ("b", 2.0 + thickness, 4.0, 1)):
+    for name, start, end, mark in (("a", 2.0, 0.0, 0), ("b", 2.0 + thickness, 4.0, 1 if seen == 2 else -1)):
         seen_from = ((start + end) / 2, 1.5)
         sides.append(plate(f"{name}/1", (start, 0, 0), (end - start, 0, 0), (0, 3, 0), seen_from, (-1, -1, -1, mark)))
         sides.append(plate(f"{name}/2", (start, 0, 0), (0, 3, 0), (0, 0, 2), seen_from, (mark, -1, -1, -1)))
@@ -278,8 +290,8 @@ def test_thin_wall_stands_in_a_gap_of_the_floor_that_is_not_closed(thickness):
         Crease((f"{name}/1", f"{name}/2"), np.array([[x, 0.0, 0.0], [x, 3.0, 0.0]]))
         for name, x in (("a", 2.0), ("b", 2.0 + thickness))
     ]
-    result = merged(map_of(*sides, creases=creases))
-    assert len(result.creases) == 2
+    result = merged(map_of(*sides, creases=creases[:seen]))
+    assert len(result.creases) == seen
     check_creases(result, 2e-5)  # the floor is not made larger for less
 
 

@@ -21,6 +21,8 @@ BENT_REACH = 0.1
 """Metres by which a bent curve goes on straight beyond its ends: around a pillar both ends come near each other."""
 SKEW = 0.3
 """Least sine of the angle between two faces of which no data set saw the crease."""
+UNEVEN = 0.01
+"""Metres by which an outline beside a crease that nobody saw may be farther off than where it is nearest."""
 EVERYWHERE = np.array([[-np.inf, np.inf]])
 
 
@@ -78,7 +80,7 @@ def unseen_curve(
 
     Scans that are parallel to an edge miss it: each face then ends at the last scan before it. And where faces touch
     without an angle nothing but two corners, with floor and ceiling, tells where one ends and the other begins. None
-    where not both outlines come within half of `gap` of the same part of the line.
+    where not both outlines come near the same part of the line, together within `gap`.
     """
     direction = np.cross(*(above(shapes[face], corners[:1])[1][0] for face in pair))
     if np.linalg.norm(direction) < SKEW:
@@ -87,26 +89,29 @@ def unseen_curve(
             return None
     ends = np.array([corners[0], corners[0] + direction / np.linalg.norm(direction)])
     line = Curve(pair, ends, np.array([0.0, 1.0]), EVERYWHERE)
-    both = [_beside(line, outlines[face], gap / 2.0) for face in pair]
-    if not all(len(intervals) for intervals in both):
+    both, off = zip(*(_beside(line, outlines[face], gap) for face in pair), strict=True)
+    if not all(len(intervals) for intervals in both) or sum(off) > gap:
         return None
     low, high = (f([f(intervals) for intervals in both]) for f in (np.min, np.max))
     shared = min(intervals.max() for intervals in both) - max(intervals.min() for intervals in both)
     if shared < APART:
         return None
     curve = _through(pair, np.array([low, high]), place(line, np.array([low, high]), shapes), [shapes[f] for f in pair])
-    return None if curve is None else curve._replace(seen=curve.t[[0, -1]][None], beside=gap / 2.0)
+    beside = max(gap / 2.0, max(off) + UNEVEN)
+    return None if curve is None else curve._replace(seen=curve.t[[0, -1]][None], beside=beside)
 
 
-def _beside(line: Curve, loops: Sequence[Array], distance: float) -> Array:
-    """(k, 2) intervals of the line's length along which sides of loops run, within a distance."""
-    found = []
+def _beside(line: Curve, loops: Sequence[Array], distance: float) -> tuple[Array, float]:
+    """(k, 2) intervals of the line's length along which sides of loops run, within a distance, and the least one."""
+    found, off = [np.zeros((0, 2))], distance
     for loop in loops:
-        t, off = locate(line, loop)
+        t, away = locate(line, loop)
         ends = np.sort(np.column_stack([t, np.roll(t, -1)]), axis=1)
-        near = np.maximum(off, np.roll(off, -1)) < distance
-        found.append(ends[near & (ends[:, 1] - ends[:, 0] > APART)])
-    return np.concatenate(found)
+        farther = np.maximum(away, np.roll(away, -1))
+        near = (farther < distance) & (ends[:, 1] - ends[:, 0] > APART)
+        found.append(ends[near])
+        off = min(off, float(farther[near].min(initial=distance)))
+    return np.concatenate(found), off
 
 
 def _main_line(points: Array) -> tuple[Array, Array]:

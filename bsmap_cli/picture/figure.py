@@ -20,6 +20,11 @@ def save(figure: Any, path: Path, ending: str) -> None:
     """Write the figure to `path` in the format of `ending`, one of ENDINGS; PNG where it is empty."""
     from matplotlib import rc_context
 
+    # The layout's last bits depend on where things lie in memory; they would go into names of an SVG's parts.
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    for axes in figure.axes:
+        axes.set_position([round(value, 6) for value in axes.get_position(original=True).bounds])
     # Without a date, and without random names of an SVG's parts, the same run gives the same bytes.
     no_date = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(ending, {})
     with rc_context({"svg.hashsalt": "bsmap"}):

@@ -17,7 +17,16 @@ import time
 from typing import NamedTuple
 
 import numpy as np
-from face_scenes import corridor_set, real_room, simulated_place
+from face_scenes import (
+    barrel_vault,
+    corridor_set,
+    dome,
+    passing_set,
+    real_room,
+    simulated_place,
+    tunnel,
+    turning_set,
+)
 from scipy.spatial import cKDTree
 
 from bsmap_cli import open3d_loader
@@ -159,6 +168,15 @@ def simulated_rows(name, seeds):
             show(f"{name} {kind}", found)
 
 
+def curved_rows(seeds):
+    """Vaults that are neither plane nor vertical cylinder, passed along and turned in."""
+    for mesh in (barrel_vault, tunnel, dome):
+        places = [passing_set(mesh(), seed=seed) for seed in range(seeds)]
+        show(f"{mesh.__name__} translation", [measure(place, np.arange(20)) for place in places])
+        places = [turning_set(mesh(), np.array([1.0, 1.2, 0.3]), seed=seed) for seed in range(seeds)]
+        show(f"{mesh.__name__} rotation", [measure(place, np.arange(19)) for place in places])
+
+
 def real():
     cloud = real_room()
     points = in_faces = control_points = faces = 0
@@ -199,6 +217,7 @@ def main(seeds):
     simulated_rows("room", max(1, seeds // 3))
     simulated_rows("corridor", max(1, seeds // 5))
     simulated_rows("loop", 1)
+    curved_rows(max(1, seeds // 3))
     real()
 
 

@@ -14,7 +14,7 @@ from bsmap_cli.evaluate import transform_points
 from bsmap_cli.model import PointCloud, SlamMap, Trajectory
 from bsmap_cli.params import CloudParams, SimulateParams
 from bsmap_cli.simulate import robot
-from bsmap_cli.simulate.geometry import arc, carve, join, room, upright
+from bsmap_cli.simulate.geometry import Mesh, arc, carve, join, room, upright
 from bsmap_cli.simulate.path import Path, poses_at, stepwise
 from bsmap_cli.simulate.raycast import Caster
 from bsmap_cli.simulate.scenes import Scene
@@ -44,21 +44,65 @@ def corridor_mesh():
     return join([boxes, bowed, pillar])
 
 
+def sheet(points):
+    """Mesh through a grid of points (n, m, 3)."""
+    n, m = points.shape[:2]
+    first = (np.arange(n - 1)[:, None] * m + np.arange(m - 1)).ravel()
+    triangles = np.concatenate([first[:, None] + [0, m, 1], first[:, None] + [1, m, m + 1]])
+    return Mesh(points.reshape(-1, 3), triangles)
+
+
+def arch(radius, height, start):
+    """Vault along x, its axis at y = 1 and z = `height`, from the angle `start` below the level on both sides."""
+    around, x = np.meshgrid(np.radians(np.arange(-start, 181 + start)), np.linspace(-6.0, 8.0, 15), indexing="ij")
+    return sheet(np.stack([x, 1.0 + radius * np.cos(around), height + radius * np.sin(around)], axis=2))
+
+
+def barrel_vault():
+    """Corridor along x, 3.2 m wide, under a round vault."""
+    box = carve([room(-6.0, 8.0, -0.6, 2.6, 0.0, 1.4)])
+    level = np.all(box.vertices[box.triangles, 2] > 1.39, axis=1)
+    return join([arch(1.6, 1.4, 0), Mesh(box.vertices, box.triangles[~level])])
+
+
+def tunnel():
+    """Round tunnel along x with a flat floor 1 m below its axis."""
+    half = 2.0 * np.cos(np.radians(30.0))
+    floor = carve([room(-6.0, 8.0, 1.0 - half, 1.0 + half, 0.0, 0.1)])
+    level = np.all(floor.vertices[floor.triangles, 2] < 0.01, axis=1)
+    return join([arch(2.0, 1.0, 30), Mesh(floor.vertices, floor.triangles[level])])
+
+
+def dome():
+    """Half a sphere on a floor."""
+    around, up = np.meshgrid(np.radians(np.arange(361)), np.radians(np.linspace(0.0, 89.9, 91)), indexing="ij")
+    level = np.cos(up)
+    half = sheet(3.0 * np.stack([level * np.cos(around), level * np.sin(around), np.sin(up)], axis=2) + [1.0, 1.0, 0.0])
+    floor = carve([room(-2.0, 4.0, -2.0, 4.0, 0.0, 0.1)])
+    level = np.all(floor.vertices[floor.triangles, 2] < 0.01, axis=1)
+    return join([half, Mesh(floor.vertices, floor.triangles[level])])
+
+
 @cache
 def caster():
     return Caster(corridor_mesh())
 
 
 def corridor_set(sigma=0.01, seed=0, scans=20, beams=541):
-    """A translation of 1.9 m in `scans` scans."""
-    mesh = corridor_mesh()
+    """A translation of 1.9 m in `scans` scans through the corridor."""
+    return passing_set(corridor_mesh(), sigma, seed, scans, beams, caster())
+
+
+def passing_set(mesh, sigma=0.01, seed=0, scans=20, beams=541, cast=None):
+    """A translation of 1.9 m along x in `scans` scans."""
+    cast = Caster(mesh) if cast is None else cast
     length = 1.9
     time = np.linspace(0.0, length, scans)
     path = Path(np.array([0.0, 3.0]), np.array([[0.0, 1.0, 0.0], [3.0, 1.0, 0.0]]), np.array([[1.0, 0.0]]))
     scene = Scene(mesh, path, time)
     laser = replace(robot.VERTICAL, beams=beams)
-    noisy = scan(laser, scene, caster(), SimulateParams(range_sigma=sigma), np.random.default_rng(seed))
-    clean = scan(laser, scene, caster(), SimulateParams(range_sigma=0.0), np.random.default_rng(seed))
+    noisy = scan(laser, scene, cast, SimulateParams(range_sigma=sigma), np.random.default_rng(seed))
+    clean = scan(laser, scene, cast, SimulateParams(range_sigma=0.0), np.random.default_rng(seed))
     poses = np.column_stack([time, np.ones(scans), np.zeros(scans)])
     trajectory = Trajectory(noisy.time_ns, poses, np.zeros((scans, 3, 3)))
     slam_map = true_slam_map(simulated("room"))

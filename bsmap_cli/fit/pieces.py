@@ -25,6 +25,12 @@ CANDIDATE = 12.0
 """Gain in chi square of two lines over one that makes a place a candidate for a break."""
 FARTHEST = 10
 """Beams by which a break is moved."""
+WIDEST_TURN = np.radians(60.0)
+"""By which a conic may turn; what is longer is divided.
+
+From there on pieces are taken for parabolas over their chords, which an arc of 60 degrees leaves by a 2500th of its
+radius.
+"""
 WIDEST_GAP = 3
 """Beams without return that a piece may bridge."""
 
@@ -53,7 +59,7 @@ def find_pieces(grid: BeamGrid) -> Pieces:
     pieces = Pieces(table[:, 0], table[:, 1], table[:, 2], table[:, 3].astype(bool))
     for _ in range(2):
         pieces = _relocate(grid, moments, pieces)
-    return pieces
+    return _shortened(grid, pieces)
 
 
 def _prefix_moments(grid: BeamGrid) -> Array:
@@ -227,3 +233,23 @@ def _best_places(grid: BeamGrid, row: IntArray, low: IntArray, high: IntArray, a
     total[:, 1:] = np.cumsum(squares[0] - squares[1], axis=1)
     total[:, 1:][~inside] = np.inf
     return np.asarray(low + np.argmin(total, axis=1))
+
+
+def _shortened(grid: BeamGrid, pieces: Pieces) -> Pieces:
+    """Pieces with the conics that turn too far divided into equal parts."""
+    parts = np.ones(len(pieces.row), dtype=np.int64)
+    for k in np.flatnonzero(pieces.curved):
+        beams = np.arange(pieces.start[k], pieces.stop[k])
+        beams = beams[grid.hit[pieces.row[k], beams]]
+        ends = beams[np.rint(np.linspace(0, len(beams) - 1, 4)).astype(np.int64)]
+        places = grid.ranges[pieces.row[k], ends] * np.exp(1j * grid.angles[ends])
+        first, _, last = np.diff(places)
+        noise = 3.0 * grid.sigma * (1.0 / abs(first) + 1.0 / abs(last))
+        # Chords of the first and the last third lie two thirds of the turn apart.
+        turn = 1.5 * (abs(np.angle(last / first)) - noise)
+        parts[k] = np.clip(np.ceil(turn / WIDEST_TURN), 1, len(beams) // FEWEST_CONIC)
+    of = np.repeat(np.arange(len(parts)), parts)
+    order = np.arange(len(of)) - (np.cumsum(parts) - parts)[of]
+    length = pieces.stop - pieces.start
+    start, stop = (pieces.start[of] + length[of] * (order + k) // parts[of] for k in (0, 1))
+    return Pieces(pieces.row[of], start, stop, pieces.curved[of])

@@ -102,6 +102,8 @@ def test_beam_that_only_grazes_a_face_misses_it():
 
 
 def test_least_surface_over_a_cylinder_bears_an_error_of_its_centre():
-    knots = least_knots(CylinderBase(np.zeros(2), 1.0, 0.0))
-    assert (knots.degree_s, knots.degree_t) == (2, 1)
-    assert least_knots(PlaneBase(np.zeros(3), np.eye(3))).shape == (2, 2)
+    base, low = CylinderBase(np.zeros(2), 1.0, 0.0), np.array([-2.0, 0.0])
+    knots = least_knots(base, low, np.array([1.0, 1.0]))
+    assert (knots.degree_s, knots.degree_t, knots.shape) == (2, 1, (3, 2))
+    assert least_knots(base, low, np.array([2.0, 1.0])).shape == (4, 2)
+    assert least_knots(PlaneBase(np.zeros(3), np.eye(3)), low, -low).shape == (2, 2)

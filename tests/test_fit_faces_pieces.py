@@ -31,9 +31,10 @@ def test_noise_is_found_from_the_ranges():
 def fields():
     plane = PlaneBase(np.array([1.0, 2.0, 3.0]), np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0])
     cylinder = CylinderBase(np.array([0.5, -1.0]), 0.8, 0.3)
+    leaning = cylinder._replace(upright=plane.axes)
     heights = np.array([[0.0, 0.05], [-0.04, 0.1]])
     low, high = np.array([-1.0, -1.0]), np.array([1.0, 1.0])
-    return [HeightField(base, low, high, flat_knots(), heights) for base in (plane, cylinder)]
+    return [HeightField(base, low, high, flat_knots(), heights) for base in (plane, cylinder, leaning)]
 
 
 def bent_field():

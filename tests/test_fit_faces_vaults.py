@@ -6,8 +6,11 @@ from face_scenes import barrel_vault, dome, passing_set, tunnel, turning_set
 
 from bsmap_cli.evaluate import distance_to_mesh
 from bsmap_cli.fit.beams import make_grid
+from bsmap_cli.fit.blocks import Blocks
 from bsmap_cli.fit.division import find_faces
+from bsmap_cli.fit.heights import CylinderBase, basis_matrix
 from bsmap_cli.fit.labels import feet_of_faces
+from bsmap_cli.fit.lowmodels import fit_axis
 from bsmap_cli.fit.pieces import find_pieces
 
 
@@ -22,6 +25,38 @@ def test_vaults_are_covered_at_their_own_noise(scene, turning):
     feet = feet_of_faces(grid, faces.labels, [f.field for f in faces.fitted])
     error = distance_to_mesh(np.concatenate([of.points for of in feet]), place.vertices, place.triangles)
     assert np.sqrt(np.mean(error**2)) < 0.002
+
+
+@pytest.mark.parametrize("turning", [False, True], ids=["translation", "rotation"])
+def test_a_tunnel_is_one_cylinder_with_a_level_axis(turning):
+    place = turning_set(tunnel(), np.array([1.0, 1.2, 0.3])) if turning else passing_set(tunnel())
+    grid = make_grid(place.cloud, np.unique(place.cloud.scan_index))
+    faces = find_faces(grid)
+    assert len(faces.fitted) == 2
+    (round_one,) = (k for k, f in enumerate(faces.fitted) if isinstance(f.field.base, CylinderBase))
+    field, information = faces.fitted[round_one][:2]
+    assert field.base.radius == pytest.approx(2.0, abs=0.005)
+    np.testing.assert_allclose(np.abs(field.base.upright[:, 2]), [1.0, 0.0, 0.0], atol=0.005)
+    assert field.knots.size <= 12
+    feet = feet_of_faces(grid, faces.labels, [f.field for f in faces.fitted])[round_one]
+    error = distance_to_mesh(feet.points, place.vertices, place.triangles)
+    assert np.sqrt(np.mean(error**2)) < 0.0006
+    N = basis_matrix(field.knots, feet.uv)
+    variance = np.sum((N @ np.linalg.inv(information)) * N, axis=1)
+    assert np.mean(error**2 < 3.84 * variance) > 0.9
+
+
+def test_axis_of_a_cylinder_is_found_from_any_part_of_it():
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        angle, along = rng.uniform(0.0, rng.uniform(1.5, 6.0), 400), rng.uniform(0.0, rng.uniform(1.0, 8.0), 400)
+        outwards = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(400)])
+        points = 1.5 * outwards + along[:, None] * [0.0, 0.0, 1.0] + 0.003 * rng.normal(size=(400, 3))
+        ones = np.ones(400)
+        blocks = Blocks(points @ axes.T, outwards @ axes.T, ones, ones.astype(int), ones, ones.astype(int))
+        found = fit_axis(blocks)
+        assert abs(found[:, 2] @ axes[:, 2]) > np.cos(0.01)
 
 
 def test_conics_that_turn_far_are_divided():

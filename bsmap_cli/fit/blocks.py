@@ -40,7 +40,7 @@ class Blocks(NamedTuple):
         return Blocks(points[keep], directions[keep], counts[keep], row[keep], column[keep], owner[keep])
 
 
-def make_blocks(grid: BeamGrid, row: IntArray, start: IntArray, stop: IntArray) -> Blocks:
+def make_blocks(grid: BeamGrid, row: IntArray, start: IntArray, stop: IntArray, largest: int = LARGEST) -> Blocks:
     """Blocks of runs of beams: row (k,), first beam (k,), beam behind the last one (k,)."""
     length = stop - start
     n = grid.ranges.shape[1]
@@ -57,7 +57,7 @@ def make_blocks(grid: BeamGrid, row: IntArray, start: IntArray, stop: IntArray) 
     ends = np.zeros((len(row), 2, 3))
     ends[owner[::-1], 0], ends[owner, 1] = points[::-1], points
     metres = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
-    share = np.ceil(np.maximum(length / LARGEST, metres / LONGEST)).astype(np.int64).clip(FEWEST)
+    share = np.ceil(np.maximum(length / largest, metres / LONGEST)).astype(np.int64).clip(FEWEST)
     number = position * np.minimum(share, length)[owner] // length[owner]
     first = np.flatnonzero((np.diff(owner, prepend=-1) != 0) | (np.diff(number, prepend=-1) != 0))
     counts = np.diff(np.append(first, len(flat))).astype(float)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from bsmap_cli.fit.absorption import absorb
 from bsmap_cli.fit.beams import BeamGrid
-from bsmap_cli.fit.blocks import Blocks, make_blocks, thinned
+from bsmap_cli.fit.blocks import LARGEST, Blocks, make_blocks, thinned
 from bsmap_cli.fit.clutter import find_planes
 from bsmap_cli.fit.crossings import find_crossings
 from bsmap_cli.fit.heights import Base, CylinderBase, HeightField, PlaneBase, plane_base
@@ -22,7 +22,7 @@ from bsmap_cli.fit.labels import (
     without_outliers,
     without_slipped_ends,
 )
-from bsmap_cli.fit.lowmodels import fit_cylinder_frame, fit_plane_frame
+from bsmap_cli.fit.lowmodels import fit_cylinder_frame, fit_plane_frame, turned
 from bsmap_cli.fit.pieces import find_pieces
 from bsmap_cli.fit.regions import find_regions
 from bsmap_cli.fit.seeds import PAIR_BEAMS
@@ -38,6 +38,8 @@ BELIEVED = 0.9
 """Share of its beams that a face must fit."""
 LITTLE = 0.05
 """Share of its beams in which a face has hardly changed."""
+MOST_ROWS = 10_000_000
+"""Elements of a design matrix up to which a face is fitted to single beams."""
 ROUNDS = 2
 """Of dividing the beams anew by the fitted surfaces."""
 
@@ -88,11 +90,17 @@ def find_faces(grid: BeamGrid) -> Faces:
 
 
 def _widened(grid: BeamGrid, labels: IntArray, fitted: list[Fitted], sigma: float) -> list[Fitted]:
-    """Faces fitted anew on rectangles that hold their creases, where the old ones do not."""
+    """Faces fitted anew on rectangles that hold their creases, where the old ones do not.
+
+    Curved faces are fitted to single beams: the mean of eight does not lie on the surface that they hit; on a vault of
+    2 m it is farther off than the fit errs.
+    """
     crossings = find_crossings(grid, labels, [f.field for f in fitted])
     out = []
-    for number, (old, blocks) in enumerate(zip(fitted, blocks_of_faces(grid, labels), strict=True)):
+    pairs = zip(blocks_of_faces(grid, labels), blocks_of_faces(grid, labels, 1), strict=True)
+    for number, (old, (blocks, beams)) in enumerate(zip(fitted, pairs, strict=True)):
         field = old.field
+        curved = field.knots.size > 4 and len(beams.counts) * field.knots.size < MOST_ROWS
         at = field.base.local(crossings.points[np.any(crossings.faces == number, axis=1)])[:, :2]
         low = np.maximum(np.vstack([at, field.low]).min(axis=0), field.low - FARTHEST)
         high = np.minimum(np.vstack([at, field.high]).max(axis=0), field.high + FARTHEST)
@@ -101,7 +109,8 @@ def _widened(grid: BeamGrid, labels: IntArray, fitted: list[Fitted], sigma: floa
             low = np.where(low < field.low, low - margin, low)
             high = np.where(high > field.high, high + margin, high)
             field = replace(field, low=low, high=high)
-            old = refit(field, blocks, sigma)
+        if field is not old.field or curved:
+            old = refit(field, beams if curved else blocks, sigma)
         out.append(old)
     return out
 
@@ -131,12 +140,13 @@ def _kept(labels: IntArray, grid: BeamGrid) -> tuple[IntArray, IntArray]:
     return new[labels], kept
 
 
-def blocks_of_faces(grid: BeamGrid, labels: IntArray) -> list[Blocks]:
-    """Blocks of each face."""
+def blocks_of_faces(grid: BeamGrid, labels: IntArray, largest: int = LARGEST) -> list[Blocks]:
+    """Blocks of each face, of up to `largest` beams of a scan; single beams stay single where scans are close, too."""
     runs = runs_of(labels)
-    blocks = make_blocks(grid, runs.row, runs.start, runs.stop)
+    blocks = make_blocks(grid, runs.row, runs.start, runs.stop, largest)
     of_face = runs.label[blocks.owner]
-    return [thinned(blocks.pick(of_face == k)) for k in range(int(labels.max(initial=-1)) + 1)]
+    picked = [blocks.pick(of_face == k) for k in range(int(labels.max(initial=-1)) + 1)]
+    return picked if largest < LARGEST else [thinned(one) for one in picked]
 
 
 def _fit_all(grid: BeamGrid, labels: IntArray, sigma: float) -> list[Fitted]:
@@ -183,14 +193,16 @@ def _refit_all(grid: BeamGrid, labels: IntArray, fields: list[HeightField], sigm
 
 
 def choose_base(blocks: Blocks, sigma: float) -> Base:
-    """Plane, or vertical cylinder where that is what the blocks lie on."""
+    """Plane, or vertical cylinder or one with another axis where that is what the blocks lie on."""
     frame = fit_plane_frame(blocks)
-    if low_order_cost(blocks, frame, sigma).is_round:
+    low = low_order_cost(blocks, frame, sigma)
+    if low.is_round:
+        blocks = turned(blocks, low.axes)
         found = fit_cylinder_frame(blocks)
         if found is not None:
             angles = np.arctan2(*(blocks.points[:, :2] - found.centre).T[::-1])
             middle = float(np.angle(np.mean(np.exp(1j * angles))))
-            return CylinderBase(found.centre, found.radius, middle)
+            return CylinderBase(found.centre, found.radius, middle, low.axes)
     return plane_base(blocks.points, frame.axes[:, 2])
 
 

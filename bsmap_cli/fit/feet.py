@@ -47,7 +47,7 @@ class Lines(NamedTuple):
 class Table(NamedTuple):
     """Height fields of f faces.
 
-    frame : (12, f) axes s, t, normal and origin; of a cylinder, x, y, z and its centre on the ground.
+    frame : (12, f) axes s, t, normal and origin; of a cylinder, two across the axis, the axis and a point of it.
     radius, middle : (f,) of cylinders; radius 0 for planes.  low, size : (2, f) of the rectangles, metres.
     least, most : (f,) parameters beyond which a surface goes on straight.  lines : along s and t.
     orders : (2, f) of the coefficients along t and s.
@@ -73,7 +73,8 @@ def tabulate(fields: Sequence[HeightField]) -> Table:
     for k, field in enumerate(fields):
         base = field.base
         if isinstance(base, CylinderBase):
-            frame[:9, k], frame[9:, k] = np.eye(3).ravel(), (*base.centre, 0.0)
+            upright = np.eye(3) if base.upright is None else base.upright
+            frame[:9, k], frame[9:, k] = upright.T.ravel(), upright[:, :2] @ base.centre
             radius[k], middle[k] = base.radius, base.middle
         else:
             frame[:9, k], frame[9:, k] = base.axes.T.ravel(), base.origin
@@ -140,12 +141,12 @@ def offsets(table: Table, face: IntArray, points: Array) -> tuple[Array, Array]:
     local = _turned(frame, p - frame[9:])
     at, arm = _round_ones(table, face, len(points))
     if len(at):
-        local[:, at], c, s = _around(table, face[at], p[:, at] - frame[9:, at])
+        local[:, at], c, s = _around(table, face[at], local[:, at])
     height, gradient, _ = _heights(table, face, local)
     normal = frame[6:9] - gradient[0] * frame[0:3] - gradient[1] * frame[3:6]
     if len(at):
         around = gradient[0, at] * arm / np.maximum(arm + local[2, at], 0.1 * arm)
-        normal[:, at] = c + around * s, s - around * c, -gradient[1, at]
+        normal[:, at] = _in_map(frame[:, at], np.stack([c + around * s, s - around * c, -gradient[1, at]]))
     length = np.sqrt(np.sum(normal**2, axis=0))
     return (local[2] - height) / length, (normal / length).T
 
@@ -157,14 +158,14 @@ def _newton(table: Table, face: IntArray, p: Array, d: Array, start: Array, step
     flat, turn = _turned(frame, p - frame[9:]), _turned(frame, d)
     at, arm = _round_ones(table, face, p.shape[1])
     every = np.broadcast_to(face, p.shape[1])
-    centre = np.broadcast_to(frame[9:], p.shape)[:, at]
+    ahead = turn[:, at]
     beyond = start.copy()
     for step in range(steps):
         local = flat + beyond * turn
         if len(at):
-            local[:, at], c, s = _around(table, every[at], p[:, at] + beyond[at] * d[:, at] - centre)
+            local[:, at], c, s = _around(table, every[at], flat[:, at] + beyond[at] * ahead)
             stretch = arm / np.maximum(arm + local[2, at], 0.1 * arm)
-            dx, dy, dz = d[:, at]
+            dx, dy, dz = ahead
             turn[:, at] = (dy * c - dx * s) * stretch, dz, dx * c + dy * s
         height, gradient, uv = _heights(table, face, local)
         climb = gradient[0] * turn[0] + gradient[1] * turn[1]
@@ -182,6 +183,12 @@ def _turned(frame: Array, vectors: Array) -> Array:
     """(3, n) vectors (3, n), each in its frame (12, n)."""
     x, y, z = vectors
     return np.stack([frame[k] * x + frame[k + 1] * y + frame[k + 2] * z for k in (0, 3, 6)])
+
+
+def _in_map(frame: Array, vectors: Array) -> Array:
+    """(3, n) vectors (3, n), given each in its frame (12, n), in map."""
+    x, y, z = vectors
+    return x * frame[0:3] + y * frame[3:6] + z * frame[6:9]
 
 
 def _round_ones(table: Table, face: IntArray, count: int) -> tuple[IntArray, Array]:

@@ -47,13 +47,18 @@ class PlaneBase(NamedTuple):
 
 
 class CylinderBase(NamedTuple):
-    """Vertical cylinder: s is the arc's length from the angle `middle`, t the height z, h the distance outwards."""
+    """Cylinder: s is the arc's length from the angle `middle`, t the way along the axis, h the distance outwards.
+
+    upright : (3, 3) columns x, y and along the axis, of the frame in which the cylinder is vertical; None: that is map.
+    """
 
     centre: Array
     radius: float
     middle: float
+    upright: Array | None = None
 
     def local(self, points: Array) -> Array:
+        points = self._own(points)
         x, y = points[..., 0] - self.centre[0], points[..., 1] - self.centre[1]
         angle = (np.arctan2(y, x) - self.middle + np.pi) % (2.0 * np.pi) - np.pi
         return np.stack([angle * self.radius, points[..., 2], np.hypot(x, y) - self.radius], axis=-1)
@@ -62,12 +67,22 @@ class CylinderBase(NamedTuple):
         angle = local[:, 0] / self.radius + self.middle
         c, s = np.cos(angle), np.sin(angle)
         around = gradient[:, 0] * self.radius / np.maximum(self.radius + local[:, 2], 0.1 * self.radius)
-        return _columns(c + around * s, s - around * c, -gradient[:, 1])
+        return self._in_map(_columns(c + around * s, s - around * c, -gradient[:, 1]))
 
     def place(self, local: Array) -> Array:
         angle, distance = local[..., 0] / self.radius + self.middle, self.radius + local[..., 2]
         x, y = self.centre[0] + distance * np.cos(angle), self.centre[1] + distance * np.sin(angle)
-        return np.stack([x, y, local[..., 1]], axis=-1)
+        return self._in_map(np.stack([x, y, local[..., 1]], axis=-1))
+
+    def outwards(self, angle: Array) -> Array:
+        """(n, 3) unit vectors away from the axis at angles (n,)."""
+        return self._in_map(np.stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))], axis=-1))
+
+    def _own(self, vectors: Array) -> Array:
+        return vectors if self.upright is None else _turned(vectors, self.upright)
+
+    def _in_map(self, vectors: Array) -> Array:
+        return vectors if self.upright is None else _turned(vectors, self.upright.T)
 
 
 Base = PlaneBase | CylinderBase
@@ -97,14 +112,18 @@ def flat_knots() -> Knots:
     return Knots(1, 1, open_knots(1), open_knots(1))
 
 
-def least_knots(base: Base) -> Knots:
-    """Knots of the least surface that can bear what the base took from the data.
+def least_knots(base: Base, low: Array, high: Array) -> Knots:
+    """Knots of the least surface that can bear what the base took from the data, on the rectangle from low to high.
 
     A plane's offset and slopes are those of a bilinear surface. A cylinder's radius and centre are heights that go like
-    1, sine and cosine around it: without a second degree the covariance would know nothing of the last.
+    1, sine and cosine around it: without a second degree, and a span for each half turn, the covariance would know
+    nothing of the last.
     """
     flat = flat_knots()
-    return flat if isinstance(base, PlaneBase) else flat._replace(degree_s=2, s=open_knots(2))
+    if isinstance(base, PlaneBase):
+        return flat
+    spans = int(np.ceil((high[0] - low[0]) / (np.pi * base.radius)))
+    return flat._replace(degree_s=2, s=clamped_knots(2, np.arange(1, spans) / spans))
 
 
 @dataclass(frozen=True, eq=False)

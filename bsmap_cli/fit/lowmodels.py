@@ -4,6 +4,7 @@ Both are linear in their unknowns, so that a region is held by sums (A, b, s): c
 x'A x - 2 b'x + s, and adding data is adding sums.
 """
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -16,6 +17,10 @@ ORDERS = (3, 6, 10, 15)
 """Unknowns of polynomials of degree 1 to 4 in two variables."""
 GRAZING = 0.05
 """Smallest sine between beam and surface that counts: flatter beams get the weight of this."""
+AXES = np.array([a for a in itertools.product((-1.0, 0.0, 1.0), repeat=3) if a > (0.0, 0.0, 0.0)])
+"""(13, 3) directions; no axis is farther than 28 degrees from all of them."""
+BASINS, TILTS = 3, 8
+"""Of them, how many are followed, and for how many steps."""
 
 
 class Sums(NamedTuple):
@@ -146,3 +151,50 @@ def fit_cylinder_frame(blocks: Blocks) -> CylinderFrame | None:
             return None
         frame = CylinderFrame(frame.centre + np.array([a, b]), float(np.sqrt(square)))
     return frame
+
+
+def turned(blocks: Blocks, axes: Array | None) -> Blocks:
+    """Blocks in a frame with columns `axes` (3, 3) in map; None: as they are."""
+    return blocks if axes is None else blocks._replace(points=blocks.points @ axes, directions=blocks.directions @ axes)
+
+
+def fit_axis(blocks: Blocks) -> Array | None:
+    """Frame (3, 3) whose third column is the axis of the cylinder through blocks; None where they lie on none.
+
+    Directions all around are tried with a linear fit of the circle across them; from the best ones Gauss and Newton.
+    """
+    tried = [(found.misfit, k) for k, axis in enumerate(AXES) if (found := _lean(blocks, axes_of(axis))) is not None]
+    best, least = None, np.inf
+    for _, k in sorted(tried)[:BASINS]:
+        axes = axes_of(AXES[k])
+        for _ in range(TILTS):
+            found = _lean(blocks, axes)
+            if found is None:
+                break
+            if found.misfit < least:
+                best, least = axes, found.misfit
+            axes = axes_of(axes @ np.append(found.tilt, 1.0))
+    return best
+
+
+class _Lean(NamedTuple):
+    """How badly a cylinder with a given axis fits, and by how much (2,) the axis should lean."""
+
+    misfit: float
+    tilt: Array
+
+
+def _lean(blocks: Blocks, axes: Array) -> _Lean | None:
+    blocks = turned(blocks, axes)
+    frame = fit_cylinder_frame(blocks)
+    if frame is None:
+        return None
+    xy = blocks.points[:, :2] - frame.centre
+    distance = np.linalg.norm(xy, axis=1)
+    n = xy / np.maximum(distance, 1e-9)[:, None]
+    sine = np.abs(np.einsum("nk,nk->n", n, blocks.directions[:, :2]))
+    root = np.sqrt(blocks.counts) / np.maximum(sine, GRAZING)
+    z = blocks.points[:, 2] - blocks.points[:, 2].mean()
+    rows = np.column_stack([z[:, None] * n, n, np.ones(len(n))]) * root[:, None]
+    miss = (distance - frame.radius) * root
+    return _Lean(float(miss @ miss), np.linalg.lstsq(rows, miss, rcond=1e-9)[0][:2])

@@ -91,7 +91,7 @@ class _Solution(NamedTuple):
 
 def fit_heights(blocks: Blocks, base: Base, low: Array, high: Array, sigma: float) -> Fitted:
     """Fit with the degrees and knots of the best criterion, found step by step from the least surface."""
-    knots = least_knots(base)
+    knots = least_knots(base, low, high)
     field = HeightField(base, low, high, knots, np.zeros(knots.shape))
     data = _linearise(field, blocks, sigma)
     best = _solve(knots, data)

@@ -75,8 +75,7 @@ def _over_cylinder(
 
 def _outwards(field: HeightField, base: CylinderBase, u: Array) -> Array:
     """(n, 3) unit vectors away from the axis at parameters u (n,)."""
-    angle = base.middle + (field.low[0] + u * (field.high[0] - field.low[0])) / base.radius
-    return np.stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))], axis=-1)
+    return base.outwards(base.middle + (field.low[0] + u * (field.high[0] - field.low[0])) / base.radius)
 
 
 def _cubic_around(field: HeightField, base: CylinderBase) -> Knots:

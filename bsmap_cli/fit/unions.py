@@ -11,14 +11,18 @@ from bsmap_cli.fit.lowmodels import (
     ORDERS,
     PlaneFrame,
     chi_squares,
+    fit_axis,
     fit_cylinder_frame,
     fit_plane_frame,
     sums_of,
+    turned,
 )
 from bsmap_cli.model import Array
 
 NEAR = 1.5
 """Metres between the boxes of two regions that may be one face."""
+VAULT = 200
+"""Blocks of a surface that may be a cylinder with any axis: clutter lies on many, and to look for them takes time."""
 
 
 class _Region(NamedTuple):
@@ -28,6 +32,7 @@ class _Region(NamedTuple):
     cost: float
     box: Array
     round: bool
+    bent: bool
 
 
 def unite_regions(context: Context, regions: list[list[int]]) -> list[list[int]]:
@@ -55,32 +60,51 @@ def _region(context: Context, members: Sequence[int]) -> _Region:
     blocks = thinned(context.blocks_of(members))
     frame = fit_plane_frame(blocks)
     box = np.array([blocks.points.min(axis=0), blocks.points.max(axis=0)])
-    cost, is_round = low_order_cost(blocks, frame, context.sigma)
-    return _Region(tuple(members), blocks, frame, cost, box, is_round)
+    low = low_order_cost(blocks, frame, context.sigma)
+    return _Region(tuple(members), blocks, frame, low.cost, box, low.is_round, low.bent)
 
 
 class LowOrder(NamedTuple):
-    """Least criterion of a low-order surface; whether that is a vertical cylinder."""
+    """Least criterion of a low-order surface; whether that is a cylinder, and its frame where it is not vertical.
+
+    bent : whether a plane would not do.
+    """
 
     cost: float
     is_round: bool
+    bent: bool
+    axes: Array | None = None
 
 
 def low_order_cost(blocks: Blocks, frame: PlaneFrame, sigma: float) -> LowOrder:
-    """Least criterion over all orders, and over a vertical cylinder where the plane's polynomials are poor."""
+    """Least criterion over all orders, and over a vertical cylinder where the plane's polynomials are poor.
+
+    A cylinder with any axis is tried where all these are: what is nearly flat lies on many cylinders.
+    """
     sums = sums_of(frame, blocks, sigma)
     rows = len(np.unique(blocks.row))
     sizes = tuple(size for size, least in zip(ORDERS, (1, 5, 8, 12), strict=True) if rows >= least)
     costs = chi_squares(sums, sizes) + PRICE * np.array(sizes)
     best = int(np.argmin(costs))
+    poor = 2.0 * len(blocks.counts) + 50.0
+    found = LowOrder(float(costs[best]), False, best > 0)
     # A plane, or what nearly is one, is no cylinder.
-    if best > 0 or costs[0] > 2.0 * len(blocks.counts) + 50.0:
-        cylinder = fit_cylinder_frame(blocks)
-        if cylinder is not None:
-            by_circle = float(chi_squares(sums_of(cylinder, blocks, sigma), (3,))[0]) + 4 * PRICE
-            if by_circle < costs[best]:
-                return LowOrder(by_circle, True)
-    return LowOrder(float(costs[best]), False)
+    if best > 0 or costs[0] > poor:
+        by_circle = _cost_of_cylinder(blocks, None, sigma)
+        if by_circle < found.cost:
+            found = LowOrder(by_circle, True, True)
+    if best > 0 and found.cost > poor and len(blocks.counts) >= VAULT and (axes := fit_axis(blocks)) is not None:
+        by_circle = _cost_of_cylinder(blocks, axes, sigma) + 2 * PRICE
+        if by_circle < found.cost:
+            found = LowOrder(by_circle, True, True, axes)
+    return found
+
+
+def _cost_of_cylinder(blocks: Blocks, axes: Array | None, sigma: float) -> float:
+    """Criterion of the cylinder along the third of `axes`, or a vertical one; infinite where there is none."""
+    blocks = turned(blocks, axes)
+    cylinder = fit_cylinder_frame(blocks)
+    return np.inf if cylinder is None else float(chi_squares(sums_of(cylinder, blocks, sigma), (3,))[0]) + 4 * PRICE
 
 
 def _joined(context: Context, a: _Region, b: _Region) -> _Region | None:
@@ -88,11 +112,13 @@ def _joined(context: Context, a: _Region, b: _Region) -> _Region | None:
     apart = np.maximum(a.box[0], b.box[0]) - np.minimum(a.box[1], b.box[1])
     if np.linalg.norm(np.maximum(apart, 0.0)) > NEAR:
         return None
-    if not (a.round or b.round) and abs(a.frame.axes[:, 2] @ b.frame.axes[:, 2]) < 0.7 and len(b.members) > 1:
+    vaulted = a.bent and b.bent and min(len(a.blocks.counts), len(b.blocks.counts)) >= VAULT // 4
+    curved = a.round or b.round or vaulted
+    if not curved and abs(a.frame.axes[:, 2] @ b.frame.axes[:, 2]) < 0.7 and len(b.members) > 1:
         return None
     height = (b.blocks.points - a.frame.origin) @ a.frame.axes[:, 2]
     lowest = np.min(np.abs(height))
-    if not (a.round or b.round) and lowest > 0.3:
+    if not curved and lowest > 0.3:
         return None
     joint = _region(context, a.members + b.members)
     if _same_side(joint) and joint.cost < a.cost + b.cost + context.slack * float(b.blocks.counts.sum()):

@@ -177,7 +177,7 @@ def join(told: Sequence[Told], frame: Frame) -> Joined:
 
     Where that does not end in a good fit, it is tried from the knots of all faces told, too.
     """
-    best = _improved(told, frame, least_knots(frame.base))
+    best = _improved(told, frame, least_knots(frame.base, frame.low, frame.high))
     own = _own_knots(told)
     if own.size > 4 and best.criterion > ENOUGH * sum(len(one.heights) for one in told):
         best = min(best, _improved(told, frame, own), key=lambda j: j.criterion)

@@ -19,9 +19,11 @@ def arc(name, radius, start, end, *, sensor, sigma=5e-4, rng=None, height=2.5, m
     marks : creases along the lower, last, upper and first border.  sides : along the lower and the upper border.
     """
     base = CylinderBase(np.zeros(2), radius, (start + end) / 2)
-    knots, half = least_knots(base), (end - start) / 2 * radius
+    half = (end - start) / 2 * radius
+    low, high = np.array([-half, 0.0]), np.array([half, height])
+    knots = least_knots(base, low, high)
     heights = np.zeros(knots.shape) if rng is None else rng.normal(0.0, sigma, knots.shape)
-    field = HeightField(base, np.array([-half, 0.0]), np.array([half, height]), knots, heights)
+    field = HeightField(base, low, high, knots, heights)
     part = PosePart(name.split("/")[0], np.asarray(sensor, dtype=float), np.zeros((3, 3)))
     spline, covariance = spline_over(field, sigma**2 * np.eye(knots.size), (part,))
     u = np.linspace(0.0, 1.0, sides + 1)

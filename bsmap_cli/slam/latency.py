@@ -14,8 +14,9 @@ FEWEST = 100
 """Turns between matched scans without which nothing is told."""
 LARGEST_TURN = 0.5
 """Radians: what goes beyond may be a slip or a false match and counts as this much."""
-CLEAR = 0.75
-"""Share of the turns' disagreement that may be left when the stamps are lined up, for a delay to be believed."""
+CLEAR = 0.6
+"""Share of the turns' disagreement at the opposite delay that may be left, for a delay to be believed. Between stamps
+the odometry is interpolated, which evens out its noise and lowers the disagreement, but to both sides alike."""
 
 
 def odometry_delay(time_ns: IntArray, poses: Array, odometry: Array, matched: NDArray[np.bool_]) -> float:
@@ -42,7 +43,7 @@ def odometry_delay(time_ns: IntArray, poses: Array, odometry: Array, matched: ND
         return 0.0
     apart = 1.0 - np.array([np.corrcoef(seen, turns)[0, 1] for turns in told]) ** 2
     best = int(np.argmin(apart))
-    clear = apart[best] < CLEAR * apart[steps] and abs(best - steps) * STEP >= LEAST_DELAY
+    clear = apart[best] < CLEAR * apart[-1 - best] and abs(best - steps) * STEP >= LEAST_DELAY
     return float(delays[best]) if clear else 0.0
 
 

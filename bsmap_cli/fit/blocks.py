@@ -74,11 +74,10 @@ def thinned(blocks: Blocks) -> Blocks:
     """
     cell = (blocks.column / LARGEST).astype(np.int64)
     order = np.lexsort((blocks.row, cell))
-    successive = order[:-1][(np.diff(cell[order]) == 0) & (np.diff(blocks.row[order]) == 1)]
-    following = order[1:][(np.diff(cell[order]) == 0) & (np.diff(blocks.row[order]) == 1)]
-    if not len(successive):
+    successive = (np.diff(cell[order]) == 0) & (np.diff(blocks.row[order]) == 1)
+    if not successive.any():
         return blocks
-    steps = np.linalg.norm(blocks.points[successive] - blocks.points[following], axis=1)
+    steps = np.linalg.norm(np.diff(blocks.points[order], axis=0)[successive], axis=1)
     scans = int(min(NARROW / np.quantile(steps, 0.95), np.ptp(blocks.row) / FEWEST_ROWS)) + 1
     if scans < 2:
         return blocks

@@ -5,13 +5,11 @@ more, came or went. A survey that did not look there says nothing.
 """
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from bsmap_cli.merge.bare import Bare, bare_floor
 from bsmap_cli.merge.oriented import STEP, Oriented, oriented_samples
+from bsmap_cli.merge.registration import Target, pairs_of, target
 from bsmap_cli.model import Array, BSplineSurface, Decision, SurfaceMap
 
 CLEAR, BEHIND = 0.03, 0.5
@@ -20,14 +18,6 @@ SHARE, LEAST_AREA = 0.5, 0.1
 """Of a face that must be seen through, and square metres of it."""
 MOVED = "moved"
 """Outcome of a decision on what is not the same in two surveys."""
-
-
-class _Seen(NamedTuple):
-    """What a survey saw near the faces in question."""
-
-    samples: Oriented
-    tree: cKDTree
-    bare: Bare
 
 
 def find_changes(
@@ -69,7 +59,7 @@ def _walls(surfaces: Sequence[BSplineSurface]) -> Oriented:
     return samples.of(samples.steep)
 
 
-def _seen(surfaces: Sequence[BSplineSurface], places: Sequence[Array]) -> _Seen | None:
+def _seen(surfaces: Sequence[BSplineSurface], places: Sequence[Array]) -> Target | None:
     """What surfaces show near places, each (n, 3)."""
     boxes = np.array([[p.min(axis=0), p.max(axis=0)] for p in places if len(p)]).reshape(-1, 2, 3)
     near = []
@@ -80,24 +70,18 @@ def _seen(surfaces: Sequence[BSplineSurface], places: Sequence[Array]) -> _Seen 
         if np.any(~apart[:, :2].any(axis=1)):
             near.append(surface)
     samples = oriented_samples(SurfaceMap(tuple(near), ()))
-    if not len(samples.points):
-        return None
-    return _Seen(samples, cKDTree(samples.keys()), bare_floor(samples))
+    return target(samples) if len(samples.points) else None
 
 
-def _seen_through(seen: _Seen, walls: Oriented) -> float:
+def _seen_through(seen: Target, walls: Oriented) -> float:
     """Share of a face's walls that a survey saw through."""
     if not len(walls.points):
         return 0.0
-    distance, nearest = map(np.asarray, seen.tree.query(walls.keys(), distance_upper_bound=BEHIND + STEP))
-    found = np.isfinite(distance)
-    partners = seen.samples.of(nearest[found])
-    ways = walls.points[found] - partners.points
-    offsets = np.sum(ways * partners.normals, axis=1)
-    aside = np.linalg.norm(ways - offsets[:, None] * partners.normals, axis=1) < 1.5 * STEP
-    behind, there = np.zeros((2, len(found)), dtype=bool)
-    behind[found] = aside & (offsets > CLEAR) & (offsets < BEHIND)
-    there[found] = aside & (np.abs(offsets) < CLEAR)
+    pairs = pairs_of(seen, walls, BEHIND)
+    before = pairs.aside < 1.5 * STEP
+    behind, there = np.zeros((2, len(walls.points)), dtype=bool)
+    behind[pairs.numbers] = before & (pairs.offsets > CLEAR)
+    there[pairs.numbers] = before & (np.abs(pairs.offsets) < CLEAR)
     through = ~there & (behind | seen.bare.under(walls.points))
     return float(walls.areas[through].sum() / walls.areas.sum())
 

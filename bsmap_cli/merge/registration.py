@@ -67,7 +67,7 @@ def thinned(samples: Oriented) -> Oriented:
     return some._replace(areas=some.areas * total / FEW)
 
 
-class _Pairs(NamedTuple):
+class Pairs(NamedTuple):
     """Samples of the moving map, moved, that have a partner: their numbers, offsets along its normal and across it, and
     its normal.
     """
@@ -78,7 +78,8 @@ class _Pairs(NamedTuple):
     normals: Array
 
 
-def _pairs(fixed: Target, moved: Oriented, reach: float) -> _Pairs:
+def pairs_of(fixed: Target, moved: Oriented, reach: float) -> Pairs:
+    """Each moved sample with the nearest of the fixed map that looks the same way, less than `reach` metres off it."""
     distance, nearest = map(np.asarray, fixed.tree.query(moved.keys(), distance_upper_bound=reach + STEP))
     numbers = np.flatnonzero(np.isfinite(distance))
     partners = fixed.samples.of(nearest[numbers])
@@ -86,7 +87,7 @@ def _pairs(fixed: Target, moved: Oriented, reach: float) -> _Pairs:
     offsets = np.sum(ways * partners.normals, axis=1)
     aside = np.linalg.norm(ways - offsets[:, None] * partners.normals, axis=1)
     near = np.abs(offsets) < reach
-    return _Pairs(numbers[near], offsets[near], aside[near], partners.normals[near])
+    return Pairs(numbers[near], offsets[near], aside[near], partners.normals[near])
 
 
 def refined(fixed: Target, moving: Oriented, pose: Array, height: float) -> tuple[Array, float]:
@@ -97,7 +98,7 @@ def refined(fixed: Target, moving: Oriented, pose: Array, height: float) -> tupl
     floor = height
     for reach in REACHES:
         moved = moving.moved(pose, height)
-        pairs = _pairs(fixed, moved, reach)
+        pairs = pairs_of(fixed, moved, reach)
         J = _by_pose(moved.points[pairs.numbers], pairs.normals, pose)
         weights = moved.areas[pairs.numbers] * (1.0 - (pairs.offsets / reach) ** 2) ** 2
         H, g = J.T @ (weights[:, None] * J), J.T @ (weights * pairs.offsets)
@@ -131,7 +132,7 @@ def judged(fixed: Target, moving: Target, pose: Array, height: float, distance: 
 
 def _compared(fixed: Target, moved: Oriented, distance: float) -> tuple[Array, float]:
     """(n,) how well samples match, 1 on a surface of the fixed map, 0 where none is near; and square metres denied."""
-    pairs = _pairs(fixed, moved, BEHIND)
+    pairs = pairs_of(fixed, moved, BEHIND)
     good = np.zeros(len(moved.points))
     good[pairs.numbers] = np.maximum(1.0 - (pairs.offsets / distance) ** 2, 0.0)
     behind = np.zeros(len(good), dtype=bool)
@@ -147,7 +148,7 @@ def placement_covariance(fixed: Target, moving: Oriented, laid: Laid, distance: 
     """
     moved = moving.moved(laid.pose, laid.height)
     walls = moved.of(moved.steep)
-    pairs = _pairs(fixed, walls, distance)
+    pairs = pairs_of(fixed, walls, distance)
     J = _by_pose(walls.points[pairs.numbers], pairs.normals, laid.pose)[:, :3]
     weights = walls.areas[pairs.numbers]
     variance = weights @ pairs.offsets**2 / weights.sum() + flatness**2

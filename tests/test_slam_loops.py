@@ -141,6 +141,24 @@ def test_bold_closures_need_another_one_that_agrees():
     assert loops._supported(look(way), far_off).tolist() == [True, True] if loops.SUPPORT_WAY > 10 else [False, False]
 
 
+def test_closure_that_stands_alone_finds_the_others_that_bear_it_out(lap):
+    """Drifted so far that the place is no candidate: a true closure leads to its neighbours, a false one to none."""
+    tracking, truth = lap
+    drifted = bent(tracking, 0.005)
+    seen = look(drifted.poses[drifted.keys])._replace(points=tracking.points)
+    last = len(truth) - 5
+    first = int(np.argmin(np.hypot(*(truth[: last // 2] - truth[last])[:, :2].T)))
+    assert np.hypot(*(seen.poses[first] - seen.poses[last])[:2]) > 3.0, "the drift hides the place"
+    there = se2.between(truth[first], truth[last])
+    true = edges((first, last, tuple(there)))
+    found = loops._witnesses(seen, true)
+    assert len(found.first) >= loops.FEWEST_WITNESSES
+    assert wrong(found, truth).max() < 0.1
+    assert loops._supported(seen, Edges(*map(np.concatenate, zip(true, found, strict=True)))).all()
+    false = edges((first, last, tuple(there + np.array([1.5, 1.0, 0.3]))))
+    assert len(loops._witnesses(seen, false).first) == 0
+
+
 def test_false_closure_among_true_ones_is_refused_and_reported(lap, monkeypatch):
     tracking, truth = lap
     last = len(truth) - 4

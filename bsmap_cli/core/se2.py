@@ -4,10 +4,12 @@ import numpy as np
 
 from bsmap_cli.model import Array, IntArray
 
+_TURN = 2 * np.pi
+
 
 def wrap(angle: Array) -> Array:
-    """Angle in [-pi, pi)."""
-    return (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi
+    """Angle in [-pi, pi). By floor, for numpy's remainder takes many times as long."""
+    return angle - _TURN * np.floor(angle / _TURN + 0.5)
 
 
 def compose(a: Array, b: Array) -> Array:

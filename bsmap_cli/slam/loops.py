@@ -30,13 +30,15 @@ AGREEMENT = 0.7
 """Share of points that must lie on the other map."""
 SOURCE_KEYS, TARGET_KEYS = 5, 10
 """Key scans before and after that make the small maps."""
-SOURCE_POINTS = 250
+SOURCE_POINTS = 150
 KEPT = 64
 """Small maps that are kept for the next candidates, for neighbours ask for the same ones."""
 CLOSURE_FLOOR = (0.02, 0.02, 0.005)
 """Standard deviations of a closure beside that of the match: metres, metres, radians."""
 BOLD, SUPPORT_WAY = (0.5, 0.1), 10.0
 """A closure that moves the trajectory by more metres or radians needs another one, so many metres of way off."""
+WITNESS_WAYS, FEWEST_WITNESSES = np.array([-9.0, -6.0, -3.0, 3.0, 6.0, 9.0]), 2
+"""Metres of way from a closure that nothing supports at which others are sought, and how many must be found."""
 WRONG = 25.0
 """Squared Mahalanobis distance beyond which a closure contradicts all the others."""
 
@@ -77,6 +79,8 @@ def close_loops(tracking: Tracking, range_sigma: float, track: Track) -> Closure
         track("slam: loops", k, ROUNDS)
         look = _Search(tracking.points, poses, way, noise)
         found = _find(look, closures, failed, _far_from(closures, way) if wide else None)
+        if wide:
+            found = joined([found, _witnesses(look, take(found, ~_supported(look, found)))])
         supported = _supported(look, found)
         alone.append(take(found, ~supported))
         found = take(found, supported)
@@ -220,8 +224,7 @@ def _supported(look: _Search, found: Edges) -> NDArray[np.bool_]:
 
     One place that looks like another is a matter of chance; several in a row that are moved alike are not.
     """
-    error, _, _ = posegraph.residuals(look.poses, found)
-    bold = (np.hypot(error[:, 0], error[:, 1]) > BOLD[0]) | (np.abs(error[:, 2]) > BOLD[1])
+    bold = ~_agree(found.relative, se2.between(look.poses[found.first], look.poses[found.second]))
     moved = se2.compose(look.poses[found.first], found.relative)  # where the closure puts its second key scan
     out = ~bold
     for k in np.flatnonzero(bold):
@@ -229,9 +232,45 @@ def _supported(look: _Search, found: Edges) -> NDArray[np.bool_]:
         near = np.flatnonzero((way > 0) & (way < SUPPORT_WAY))
         # Where this closure would put the other one's key scan, by the trajectory between the two.
         there = se2.compose(moved[k], se2.between(look.poses[found.second[k]], look.poses[found.second[near]]))
-        apart = se2.between(there, moved[near])
-        out[k] = bool(np.any((np.hypot(apart[:, 0], apart[:, 1]) < BOLD[0]) & (np.abs(apart[:, 2]) < BOLD[1])))
+        out[k] = bool(np.any(_agree(there, moved[near])))
     return out
+
+
+def _witnesses(look: _Search, alone: Edges) -> Edges:
+    """Closures that bear out those that nothing supports, looked for where these would put the places near by.
+
+    After a long way to a known place the poses may be off so far that hardly any candidate leads to a match. One that
+    did tells where its neighbours are; what FEWEST_WITNESSES of them find there is no chance.
+    """
+    found = [_no_edges()]
+    for first, second, relative in zip(alone.first.tolist(), alone.second.tolist(), alone.relative, strict=True):
+        there = se2.compose(se2.compose(look.poses[first], relative), se2.between(look.poses[second], look.poses))
+        others = np.unique(np.searchsorted(look.way, look.way[second] + WITNESS_WAYS).clip(max=len(look.way) - 1))
+        seen = [_witness(look, other, there[other]) for other in others.tolist() if other != second]
+        agreeing = [closure for closure in seen if closure is not None]
+        if len(agreeing) >= FEWEST_WITNESSES:
+            found += agreeing
+    return joined(found)
+
+
+def _witness(look: _Search, here: int, pose: Array) -> Edges | None:
+    """The closure of a key scan, were it at `pose` (3,), with the nearest one of long before."""
+    distance = np.hypot(*(look.poses[: here + 1, :2] - pose[:2]).T)
+    distance[look.way[here] - look.way[: here + 1] <= LEAST_WAY] = np.inf
+    before = int(np.argmin(distance))
+    if distance[before] > REACH:
+        return None
+    target = _target(look, before, _around(before, TARGET_KEYS, len(look.poses)))
+    source = _source(look, here, _around(here, SOURCE_KEYS, len(look.poses)))
+    guess = se2.between(look.poses[before], pose)
+    seen = _register(source, target, guess, look.noise, 0.0, 0.0)
+    return _closure(before, here, seen) if seen is not None and _agree(guess, seen.pose) else None
+
+
+def _agree(a: Array, b: Array) -> NDArray[np.bool_]:
+    """Whether poses (..., 3) differ by no more than closures that move the trajectory alike."""
+    apart = se2.between(a, b)
+    return np.asarray((np.hypot(apart[..., 0], apart[..., 1]) < BOLD[0]) & (np.abs(apart[..., 2]) < BOLD[1]))
 
 
 def _reach(way: Array) -> Array:
@@ -261,21 +300,20 @@ def _around(centre: int, half: int, count: int) -> range:
 
 
 def _source(look: _Search, centre: int, keys: range) -> OrientedPoints:
-    """Points of key scans in the frame of one of them, thinned."""
-    points = _small_map(look, centre, keys)
-    thin = slice(None, None, max(1, len(points.xy) // SOURCE_POINTS))
-    return OrientedPoints(points.xy[thin], points.normal[thin])
+    """Points of key scans in the frame of one of them, evenly thinned to about SOURCE_POINTS."""
+    count = sum(len(look.points[j].xy) for j in keys)
+    return _small_map(look, centre, keys, max(1, count // SOURCE_POINTS))
 
 
 def _target(look: _Search, centre: int, keys: range) -> Target:
     return make_target(_small_map(look, centre, keys))
 
 
-def _small_map(look: _Search, centre: int, keys: Sequence[int]) -> OrientedPoints:
-    """Points of key scans in the frame of one of them."""
-    relative = se2.between(look.poses[centre], look.poses[list(keys)])
-    poses = np.repeat(relative, [len(look.points[j].xy) for j in keys], axis=0)
-    return joined([look.points[j] for j in keys]).moved(poses)
+def _small_map(look: _Search, centre: int, keys: Sequence[int], step: int = 1) -> OrientedPoints:
+    """Every `step`-th point of key scans in the frame of one of them."""
+    points = take(joined([look.points[j] for j in keys]), slice(None, None, step))
+    owner = np.repeat(np.arange(len(keys)), [len(look.points[j].xy) for j in keys])[::step]
+    return points.moved(se2.between(look.poses[centre], look.poses[list(keys)])[owner])
 
 
 def _register(

@@ -40,10 +40,14 @@ class OrientedPoints(NamedTuple):
 
 
 class Target(NamedTuple):
-    """Map to match against: its points and a spatial index of them."""
+    """Map to match against: its points, a spatial index of them, and their lines.
+
+    lines : (n + 1, 3), normal and offset of each; the last one, 0, stands for no point.
+    """
 
     points: OrientedPoints
     tree: cKDTree
+    lines: Array
 
 
 class Match(NamedTuple):
@@ -60,11 +64,14 @@ class Match(NamedTuple):
 
 def make_target(points: OrientedPoints) -> Target:
     """Target of points given in one frame."""
-    return Target(points, cKDTree(points.xy, balanced_tree=False, compact_nodes=False))
+    lines = np.zeros((len(points.xy) + 1, 3))
+    lines[:-1, :2] = points.normal
+    lines[:-1, 2] = np.einsum("ij,ij->i", points.xy, points.normal)
+    return Target(points, cKDTree(points.xy, balanced_tree=False, compact_nodes=False), lines)
 
 
 def nearest_points(target: Target, xy: Array, reach: float) -> tuple[Array, IntArray]:
-    """Distances (k,) and indices (k,) of the target's points nearest to `xy` (k, 2); infinite beyond `reach`."""
+    """Distances (k,) and indices (k,) of the target's points nearest to `xy` (k, 2); infinite and n beyond `reach`."""
     distance, index = target.tree.query(xy, distance_upper_bound=reach)
     return np.asarray(distance), np.asarray(index)
 
@@ -190,14 +197,10 @@ def _pair(source: OrientedPoints, target: Target, pose: Array, reach: float) -> 
     """Each point of the source, at `pose` (3,), with the nearest of the target that faces its way."""
     R = _turn(pose[2]).T
     distance, nearest = nearest_points(target, source.xy @ R + pose[:2], reach)
-    hit = np.flatnonzero(distance < reach)
-    nearest = nearest[hit]
-    normal = target.points.normal[nearest]
-    facing = source.normal[hit] @ R
-    same = facing[:, 0] * normal[:, 0] + facing[:, 1] * normal[:, 1] > SAME_WAY
-    hit, normal, xy = hit[same], normal[same].T, target.points.xy[nearest[same]].T
-    offset = xy[0] * normal[0] + xy[1] * normal[1]
-    return _Pairs(pose.copy(), reach, source.xy[hit].T, normal, offset, distance[hit])
+    lines, facing = target.lines[nearest], source.normal @ R
+    same = np.flatnonzero(lines[:, 0] * facing[:, 0] + lines[:, 1] * facing[:, 1] > SAME_WAY)
+    lines = lines[same].T
+    return _Pairs(pose.copy(), reach, source.xy[same].T, lines[:2], lines[2], distance[same])
 
 
 def search(

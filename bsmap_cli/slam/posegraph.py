@@ -60,14 +60,6 @@ def weighted(edges: Edges, error: Array) -> tuple[Array, Array]:
     return distance, edges.information * weight[:, None, None]
 
 
-def block_matrix(rows: IntArray, columns: IntArray, blocks: Array, size: int) -> sparse.csc_matrix:
-    """Sparse (size, size) matrix of blocks (k, a, b) whose first entries are at `rows` and `columns` (k,); sums."""
-    a, b = blocks.shape[1:]
-    row = np.broadcast_to(rows[:, None, None] + np.arange(a)[:, None], blocks.shape)
-    column = np.broadcast_to(columns[:, None, None] + np.arange(b), blocks.shape)
-    return sparse.csc_matrix((blocks.ravel(), (row.ravel(), column.ravel())), shape=(size, size))
-
-
 class Term(NamedTuple):
     """What some observations add to the normal equations.
 
@@ -100,9 +92,19 @@ def edge_term(poses: Array, edges: Edges) -> Term:
 
 
 def term_matrix(term: Term, size: int) -> sparse.csc_matrix:
-    """Sparse (size, size) normal matrix of one term."""
-    parts = [block_matrix(rows, columns, values, size) for rows, columns, values in term.blocks]
-    return sum(parts[1:], parts[0])
+    """Sparse (size, size) normal matrix of one term; blocks in one place add up."""
+    values = [blocks.ravel() for _, _, blocks in term.blocks]
+    entries = [_entries(*block) for block in term.blocks]
+    rows, columns = (np.concatenate([entry[k] for entry in entries]) for k in (0, 1))
+    return sparse.csc_matrix((np.concatenate(values), (rows, columns)), shape=(size, size))
+
+
+def _entries(rows: IntArray, columns: IntArray, blocks: Array) -> tuple[IntArray, IntArray]:
+    """Row and column of each entry of blocks (k, a, b) that begin at `rows` and `columns` (k,)."""
+    a, b = blocks.shape[1:]
+    row = np.broadcast_to(rows[:, None, None] + np.arange(a)[:, None], blocks.shape)
+    column = np.broadcast_to(columns[:, None, None] + np.arange(b), blocks.shape)
+    return row.ravel(), column.ravel()
 
 
 def add_side(side: Array, term: Term) -> None:

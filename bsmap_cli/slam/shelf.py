@@ -11,9 +11,9 @@ from bsmap_cli.slam import filter
 from bsmap_cli.slam.filter import FilterState
 from bsmap_cli.slam.upkeep import Landmarks, discard, no_landmarks
 
-REACH = 30.0
+REACH = 15.0
 """Metres from the robot within which a line may be seen again."""
-UNSEEN = 40
+UNSEEN = 20
 """Key scans without a sight of it after which a line beyond REACH is laid aside."""
 EVERY = 5
 """Key scans from one look around to the next."""

@@ -20,8 +20,8 @@ from bsmap_cli.slam.scatter import weighed
 from bsmap_cli.slam.segments import Segments
 from bsmap_cli.slam.sightings import Sightings, extents_and_hits, match_all, sighting_term
 
-ROUNDS = 3
-ITERATIONS = 5
+ITERATIONS, HONEST_ITERATIONS = (3, 3, 5), 5
+"""Steps of Gauss-Newton after each matching of segments to lines; of the variances at the poses found."""
 CONVERGED, SETTLED = 1e-4, 0.01
 """Metres and radians: poses that move less are found; relative change of the variances' scales at which these are."""
 POSE_SPREAD = (0.05, 0.015)
@@ -91,11 +91,11 @@ def smooth(
     parameters = np.where(flip[:, None], lines.parameters * [1, -1] + [np.pi, 0], lines.parameters)
     extents = np.where(flip[:, None], -lines.extents[:, ::-1], lines.extents)
     spread, scales = POSE_SPREAD, np.ones(3)
-    for k in range(ROUNDS):
+    for k, iterations in enumerate(ITERATIONS):
         sightings = match_all(poses, parameters, extents, segments, params.gate, params.overlap_margin, spread)
         taken = sightings if k == 0 else weighed(poses, parameters, sightings, segments, floors)
         problem = _Problem(*every, taken)
-        for _ in range(ITERATIONS):
+        for _ in range(iterations):
             information, side = _normal_equations(poses, parameters, problem.scaled(scales))
             factors = posegraph.factorise(information)
             poses, parameters, largest = _stepped(poses, parameters, factors.solve(side))
@@ -113,7 +113,7 @@ def smooth(
 def _honest_information(poses: Array, lines: Array, problem: _Problem) -> tuple[sparse.csc_matrix, Array]:
     """Information at the poses found, and the variances' scales (3,) that what is left of the errors there tells."""
     scales = np.ones(3)
-    for _ in range(ITERATIONS):
+    for _ in range(HONEST_ITERATIONS):
         information, _ = _normal_equations(poses, lines, problem.scaled(scales))
         factors = posegraph.factorise(information)
         change = _variance_components(problem.scaled(scales), poses, lines, factors)

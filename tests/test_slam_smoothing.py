@@ -10,8 +10,9 @@ from reference import central_differences
 from bsmap_cli.core import se2
 from bsmap_cli.model import LineMap
 from bsmap_cli.params import SlamParams
-from bsmap_cli.slam.posegraph import ROBUST_WIDTH, Edges
-from bsmap_cli.slam.scatter import FEWEST, LEAST_FLOOR, by_parts, by_scatter
+from bsmap_cli.slam import posegraph
+from bsmap_cli.slam.posegraph import ROBUST_WIDTH, Edges, robust_means
+from bsmap_cli.slam.scatter import FEWEST, LEAST_FLOOR, PROBES, by_parts, by_scatter, centred, fitted_variances
 from bsmap_cli.slam.segments import Segments
 from bsmap_cli.slam.sightings import Sightings, match_all, sighting_term
 from bsmap_cli.slam.smoothing import Evidence, smooth
@@ -190,7 +191,7 @@ def test_line_whose_sightings_scatter_counts_for_less_and_the_others_stay_as_the
     information = np.linalg.inv(segments.covariances)
     line = np.arange(len(segments.scan)) % len(WALLS)
     sightings = Sightings(segments.scan, line, parameters, information, np.arange(len(line)))
-    found = by_scatter(case.truth, WALLS, sightings)
+    found = by_scatter(case.truth, WALLS, sightings, np.zeros((len(line), 2)))
     left = found.information[:, 1, 1] / information[:, 1, 1]
     assert left[board].max() < 0.4
     assert left[line != 4].min() > 0.7
@@ -221,28 +222,79 @@ def scattered(noise_scale: float, floor_scale: float, seed: int = 2) -> tuple[Si
     return seen, segments, lines
 
 
+FLOORS = np.array([0.0005, 0.001])
+
+
+def parts_of(seen: Sightings, segments: Segments, lines: np.ndarray, fitted: np.ndarray) -> Sightings:
+    return by_parts(np.zeros((1, 3)), lines, seen, segments.covariances[: len(seen.line)], FLOORS, fitted)
+
+
+def scales_found(found: Sightings, segments: Segments) -> np.ndarray:
+    """Of noise and floor in the variances of direction."""
+    alpha, told = np.linalg.inv(found.information)[:, 0, 0], segments.covariances[:, 0, 0]
+    parts = np.stack([told - FLOORS[0] ** 2, np.full(len(told), FLOORS[0] ** 2)], axis=1)
+    return np.linalg.lstsq(parts, alpha, rcond=None)[0]
+
+
 @pytest.mark.parametrize("scales", [(1.0, 1.0), (0.5, 4.0), (2.0, 0.2)])
 def test_noise_and_floor_of_segments_are_told_apart_by_what_is_left_of_their_errors(scales):
     seen, segments, lines = scattered(*scales)
-    floors = np.array([0.0005, 0.001])
-    found = np.linalg.inv(by_parts(np.zeros((1, 3)), lines, seen, segments, floors).information)
-    centre = segments.extents.mean(axis=1)
-    alpha, told = found[:, 0, 0], segments.covariances[:, 0, 0]
-    np.testing.assert_allclose(found[:, 0, 1], centre * alpha, rtol=1e-9)
-    fitted = np.linalg.lstsq(
-        np.stack([told - floors[0] ** 2, np.full(len(told), floors[0] ** 2)], 1), alpha, rcond=None
-    )[0]
-    assert fitted[1] / fitted[0] == pytest.approx(scales[1] / scales[0], rel=0.35, abs=0.1)
+    found = parts_of(seen, segments, lines, np.zeros((len(seen.line), 2)))
+    centre, alpha = segments.extents.mean(axis=1), np.linalg.inv(found.information)
+    np.testing.assert_allclose(alpha[:, 0, 1], centre * alpha[:, 0, 0], rtol=1e-9)
+    np.testing.assert_allclose(scales_found(found, segments), scales, rtol=0.2, atol=0.15)
+
+
+def test_errors_that_lack_what_was_fitted_to_them_still_tell_the_whole_noise():
+    """Of every error a share is taken away, as a fit does on average, and the variance of that share is told."""
+    seen, segments, lines = scattered(1.0, 1.0)
+    left = seen._replace(observed=lines[seen.line] + np.sqrt(0.4) * (seen.observed - lines[seen.line]))
+    fitted = 0.6 * centred(segments.covariances)[1]
+    np.testing.assert_allclose(scales_found(parts_of(left, segments, lines, fitted), segments), 1.0, rtol=0.25)
+    np.testing.assert_allclose(scales_found(parts_of(left, segments, lines, 0.0 * fitted), segments), 0.4, rtol=0.25)
 
 
 def test_walls_that_are_flat_keep_a_share_of_the_floor():
     seen, segments, lines = scattered(1.0, 0.0)
-    floors = np.array([0.0005, 0.001])
-    found = np.linalg.inv(by_parts(np.zeros((1, 3)), lines, seen, segments, floors).information)
-    assert found[:, 0, 0].min() > LEAST_FLOOR * floors[0] ** 2
+    found = np.linalg.inv(parts_of(seen, segments, lines, np.zeros((len(seen.line), 2))).information)
+    assert found[:, 0, 0].min() > LEAST_FLOOR * FLOORS[0] ** 2
 
 
 def test_few_sightings_do_not_tell_noise_from_floor():
     seen, segments, lines = scattered(1.0, 4.0)
     few = Sightings(*(column[: FEWEST - 1] for column in seen))
-    assert by_parts(np.zeros((1, 3)), lines, few, segments, np.array([0.0005, 0.001])) is few
+    assert parts_of(few, segments, lines, np.zeros((len(few.line), 2))) is few
+
+
+def test_fitted_variances_are_those_of_what_poses_and_lines_predict():
+    """Against the dense diagonal of A N^-1 A', by central differences; random signs leave an error, but no bias."""
+    case = Case(3)
+    segments, poses = case.segments, case.truth
+    line = np.arange(len(segments.scan)) % len(WALLS)
+    seen = Sightings(
+        segments.scan, line, segments.parameters, np.linalg.inv(segments.covariances), np.arange(len(line))
+    )
+    terms = [sighting_term(poses, WALLS, seen), posegraph.edge_term(poses, case.odometry)]
+    n, size = len(poses), 3 * len(poses) + 2 * len(WALLS)
+    N = sum(posegraph.term_matrix(term, size) for term in terms)[3:, 3:]
+    covariance = np.linalg.inv(N.toarray())
+    found = fitted_variances(poses, WALLS, seen, segments.covariances, posegraph.factorise(N.tocsc()))
+    exact = np.zeros_like(found)
+    for k in range(len(line)):
+        c, s = np.cos(WALLS[line[k], 0]), np.sin(WALLS[line[k], 0])
+        x, y = poses[segments.scan[k], :2]
+        A = np.zeros((2, size))
+        A[:, 3 * segments.scan[k] : 3 * segments.scan[k] + 3] = [[0, 0, 1], [c, s, 0]]
+        A[:, 3 * n + 2 * line[k] : 3 * n + 2 * line[k] + 2] = [[-1, 0], [y * c - x * s, -1]]
+        exact[k] = np.diag(A[:, 3:] @ covariance @ A[:, 3:].T)  # the covariances are diagonal: centred at 0
+    assert found.mean(axis=0) == pytest.approx(exact.mean(axis=0), rel=0.15)
+    assert np.abs(found - exact).max() < 3 * np.max(SEEN**2) / np.sqrt(PROBES) * 2
+
+
+def test_means_of_the_robust_weight_are_those_of_drawn_errors():
+    rng = np.random.default_rng(0)
+    for freedom in (1, 2, 3):
+        distance = (rng.normal(size=(400000, freedom)) ** 2).sum(axis=1)
+        weight = 1.0 / (1.0 + distance / ROBUST_WIDTH)
+        expected = float(weight.mean()), float((weight * distance).mean())
+        assert robust_means(freedom) == pytest.approx(expected, rel=0.01)

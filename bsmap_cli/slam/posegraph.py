@@ -1,11 +1,13 @@
 """Pose graph in the plane: sparse Gauss-Newton with a robust loss (Grisetti et al. 2010; Kuemmerle et al. 2011)."""
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
+from scipy.special import roots_genlaguerre
 
 from bsmap_cli.core import se2
 from bsmap_cli.errors import BsmapError
@@ -60,17 +62,32 @@ def weighted(edges: Edges, error: Array) -> tuple[Array, Array]:
     return distance, edges.information * weight[:, None, None]
 
 
+@lru_cache
+def robust_means(freedom: int) -> tuple[float, float]:
+    """Means of the robust weight w and of w d, where the squared distance d is chi-square with so much freedom.
+
+    By Gauss-Laguerre quadrature. Errors that are as the covariance tells lose weight too: without these means a
+    variance that is found by weighted squares comes out too small.
+    """
+    nodes, shares = roots_genlaguerre(40, freedom / 2 - 1)
+    distance, shares = 2 * nodes, shares / shares.sum()
+    weight = 1.0 / (1.0 + distance / ROBUST_WIDTH)
+    return float(shares @ weight), float(shares @ (weight * distance))
+
+
 class Term(NamedTuple):
     """What some observations add to the normal equations.
 
     blocks : (rows, columns, values (k, a, b)) of the matrix.  sides : (rows, values (k, a)) of the right-hand side.
     distance : sum of the weighted squared Mahalanobis distances.  observations : their number, weighted.
+    share : of the distance that the weights leave, for each observation, where errors are as the covariances tell.
     """
 
     blocks: list[tuple[IntArray, IntArray, Array]]
     sides: list[tuple[IntArray, Array]]
     distance: float
     observations: float
+    share: float
 
 
 def edge_term(poses: Array, edges: Edges) -> Term:
@@ -88,18 +105,22 @@ def edge_term(poses: Array, edges: Edges) -> Term:
         (j, i, np.swapaxes(cross, 1, 2)),
     ]
     sides = [(i, -np.einsum("mij,mj->mi", first_w, error)), (j, -np.einsum("mij,mj->mi", second_w, error))]
-    return Term(blocks, sides, float(weight @ distance), 3 * float(weight.sum()))
+    total = float(weight.sum())
+    mean, mean_distance = robust_means(3)
+    robust = float(weight[edges.robust].sum()) / max(total, 1e-300)
+    share = 1.0 - robust * (1.0 - mean_distance / (3 * mean))
+    return Term(blocks, sides, float(weight @ distance), 3 * total, share)
 
 
 def term_matrix(term: Term, size: int) -> sparse.csc_matrix:
     """Sparse (size, size) normal matrix of one term; blocks in one place add up."""
     values = [blocks.ravel() for _, _, blocks in term.blocks]
-    entries = [_entries(*block) for block in term.blocks]
-    rows, columns = (np.concatenate([entry[k] for entry in entries]) for k in (0, 1))
+    places = [entries(*block) for block in term.blocks]
+    rows, columns = (np.concatenate([place[k] for place in places]) for k in (0, 1))
     return sparse.csc_matrix((np.concatenate(values), (rows, columns)), shape=(size, size))
 
 
-def _entries(rows: IntArray, columns: IntArray, blocks: Array) -> tuple[IntArray, IntArray]:
+def entries(rows: IntArray, columns: IntArray, blocks: Array) -> tuple[IntArray, IntArray]:
     """Row and column of each entry of blocks (k, a, b) that begin at `rows` and `columns` (k,)."""
     a, b = blocks.shape[1:]
     row = np.broadcast_to(rows[:, None, None] + np.arange(a)[:, None], blocks.shape)

@@ -7,7 +7,7 @@ import numpy as np
 from bsmap_cli.core import se2
 from bsmap_cli.core.gaussian import chi2_gate
 from bsmap_cli.model import Array, IntArray
-from bsmap_cli.slam.posegraph import ROBUST_WIDTH, Term
+from bsmap_cli.slam.posegraph import ROBUST_WIDTH, Term, robust_means
 from bsmap_cli.slam.segments import Segments
 
 AT_ONCE = 400
@@ -92,16 +92,21 @@ def errors(poses: Array, lines: Array, sightings: Sightings) -> Array:
     return np.stack([turn, apart], axis=1)
 
 
-def sighting_term(poses: Array, lines: Array, sightings: Sightings) -> Term:
-    """Blocks of the lines seen, Eq. (9)-(10), with a robust weight: a false match must not bend the map."""
-    pose, (alpha, r) = poses[sightings.pose], lines[sightings.line].T
+def derivatives(poses: Array, lines: Array, sightings: Sightings) -> tuple[Array, Array]:
+    """Of `errors` by the pose (m, 2, 3) and by the line (m, 2, 2), Eq. (10)."""
+    pose, alpha = poses[sightings.pose], lines[sightings.line, 0]
     c, s = np.cos(alpha), np.sin(alpha)
-    error = errors(poses, lines, sightings)
-    by_pose = np.zeros((len(r), 2, 3))  # of the error: minus the derivatives of h
+    by_pose = np.zeros((len(alpha), 2, 3))
     by_pose[:, 0, 2], by_pose[:, 1, 0], by_pose[:, 1, 1] = 1.0, c, s
-    by_line = np.zeros((len(r), 2, 2))
+    by_line = np.zeros((len(alpha), 2, 2))
     by_line[:, 0, 0] = by_line[:, 1, 1] = -1.0
     by_line[:, 1, 0] = pose[:, 1] * c - pose[:, 0] * s
+    return by_pose, by_line
+
+
+def sighting_term(poses: Array, lines: Array, sightings: Sightings) -> Term:
+    """Blocks of the lines seen, Eq. (9)-(10), with a robust weight: a false match must not bend the map."""
+    error, (by_pose, by_line) = errors(poses, lines, sightings), derivatives(poses, lines, sightings)
     distance = np.einsum("mi,mij,mj->m", error, sightings.information, error)
     weight = 1.0 / (1.0 + distance / ROBUST_WIDTH)
     weights = sightings.information * weight[:, None, None]
@@ -115,7 +120,8 @@ def sighting_term(poses: Array, lines: Array, sightings: Sightings) -> Term:
         (j, i, np.swapaxes(cross, 1, 2)),
     ]
     sides = [(i, -np.einsum("mij,mj->mi", pose_w, error)), (j, -np.einsum("mij,mj->mi", line_w, error))]
-    return Term(blocks, sides, float(weight @ distance), 2 * float(weight.sum()))
+    mean, mean_distance = robust_means(2)
+    return Term(blocks, sides, float(weight @ distance), 2 * float(weight.sum()), mean_distance / (2 * mean))
 
 
 def extents_and_hits(poses: Array, lines: Array, sightings: Sightings, segments: Segments) -> tuple[Array, IntArray]:

@@ -83,7 +83,7 @@ def smooth(
     """Poses (n, 3) and lines that agree best with all evidence and with the segments of the key scans.
 
     every : all that helps to find the poses; matches among it use the same points as the lines.
-    distinct : no noise twice in it; from it, at the poses found, comes the information.
+    distinct : no noise twice in it; from it, once the pairs are found, come the last step and the information.
     segments : `scan` is the key pose.  params : gate and margin of the filter's association, floors of a segment.
     """
     floors = np.array([params.line_angle_floor, params.line_offset_floor])
@@ -91,9 +91,10 @@ def smooth(
     parameters = np.where(flip[:, None], lines.parameters * [1, -1] + [np.pi, 0], lines.parameters)
     extents = np.where(flip[:, None], -lines.extents[:, ::-1], lines.extents)
     spread, scales = POSE_SPREAD, np.ones(3)
-    for k, iterations in enumerate(ITERATIONS):
+    factors: SuperLU | None = None
+    for iterations in ITERATIONS:
         sightings = match_all(poses, parameters, extents, segments, params.gate, params.overlap_margin, spread)
-        taken = sightings if k == 0 else weighed(poses, parameters, sightings, segments, floors)
+        taken = weighed(poses, parameters, sightings, segments, floors, factors)
         problem = _Problem(*every, taken)
         for _ in range(iterations):
             information, side = _normal_equations(poses, parameters, problem.scaled(scales))
@@ -103,27 +104,33 @@ def smooth(
             scales = np.maximum(scales, [LEAST_STEP_SCALE, 0.0, 0.0])
             if largest < CONVERGED:
                 break
-        extents, hits = extents_and_hits(poses, parameters, sightings, segments)
+        extents, _ = extents_and_hits(poses, parameters, sightings, segments)
         spread = (POSE_SPREAD[0] / 2, POSE_SPREAD[1] / 2)
-    taken = weighed(poses, parameters, sightings, segments, floors)
-    information, scales = _honest_information(poses, parameters, _Problem(*distinct, taken))
+    taken = weighed(poses, parameters, sightings, segments, floors, factors)
+    poses, parameters, information, scales = _honest(poses, parameters, _Problem(*distinct, taken))
+    extents, hits = extents_and_hits(poses, parameters, taken, segments)
     return Smoothed(poses, parameters, extents, hits, information, scales)
 
 
-def _honest_information(poses: Array, lines: Array, problem: _Problem) -> tuple[sparse.csc_matrix, Array]:
-    """Information at the poses found, and the variances' scales (3,) that what is left of the errors there tells."""
+def _honest(poses: Array, lines: Array, problem: _Problem) -> tuple[Array, Array, sparse.csc_matrix, Array]:
+    """Poses and lines by what counts no noise twice, their information, and the variances' scales (3,).
+
+    The information tells how far off the poses are that agree best with the same evidence. Those that more evidence
+    found, which errs together, may be farther off: steps along a corridor, all a little long, drew out its doors.
+    """
     scales = np.ones(3)
     for _ in range(HONEST_ITERATIONS):
-        information, _ = _normal_equations(poses, lines, problem.scaled(scales))
+        information, side = _normal_equations(poses, lines, problem.scaled(scales))
         factors = posegraph.factorise(information)
+        poses, lines, largest = _stepped(poses, lines, factors.solve(side))
         change = _variance_components(problem.scaled(scales), poses, lines, factors)
         before, scales = scales, scales * change
         # What odometry is off by in a few steps says little of its drift, which is systematic; and that neighbouring
-        # matches, which share most of their points, agree does not make them better.
-        scales = np.maximum(scales, [LEAST_ODOMETRY_SCALE, 1.0, 0.0])
-        if np.abs(np.log(scales / before)).max() < SETTLED:
+        # matches, which share most of their points, agree does not make them better. Lines have been weighed.
+        scales = np.maximum(scales, [LEAST_ODOMETRY_SCALE, 1.0, 1.0])
+        if largest < CONVERGED and np.abs(np.log(scales / before)).max() < SETTLED:
             break
-    return _normal_equations(poses, lines, problem.scaled(scales))[0], scales
+    return poses, lines, _normal_equations(poses, lines, problem.scaled(scales))[0], scales
 
 
 def _normal_equations(poses: Array, lines: Array, problem: _Problem) -> tuple[sparse.csc_matrix, Array]:
@@ -165,5 +172,5 @@ def _variance_components(problem: _Problem, poses: Array, lines: Array, factors:
         redundancy = term.observations - float(np.einsum("ik,ik->", solved, part @ probes)) / PROBES
         # Without much left over, a part tells nothing of its own errors.
         if redundancy > max(10.0, 0.05 * term.observations):
-            scales[k] = np.clip(term.distance / redundancy, LEAST_SCALE, MOST_SCALE)
+            scales[k] = np.clip(term.distance / (term.share * redundancy), LEAST_SCALE, MOST_SCALE)
     return scales

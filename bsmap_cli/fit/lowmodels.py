@@ -5,10 +5,12 @@ x'A x - 2 b'x + s, and adding data is adding sums.
 """
 
 import itertools
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bsmap_cli.fit.blocks import Blocks
 from bsmap_cli.model import Array
@@ -21,8 +23,15 @@ AXES = np.array([a for a in itertools.product((-1.0, 0.0, 1.0), repeat=3) if a >
 """(13, 3) directions; no axis is farther than 28 degrees from all of them."""
 BASINS, TILTS = 3, 8
 """Of them, how many are followed, and for how many steps."""
+UPRIGHT = 1e-4
+"""Radians by which an axis that is right may still lean."""
 ENOUGH_BLOCKS = 300, 1500
-"""Evenly taken, to tell directions apart and to follow them: heights over the base make up for what the axis misses."""
+"""Evenly taken, to tell directions apart and for the best of them: heights over the base make up for what the axis
+misses."""
+LEAST_RADIUS, LARGEST_RADIUS = 0.05, 5.0
+"""Metres, of cylinders."""
+UNTOLD = 1e-12
+"""Share of its own square by which an unknown that the rows do not tell is held near 0."""
 
 
 class Sums(NamedTuple):
@@ -115,44 +124,77 @@ def sums_of(frame: Frame, blocks: Blocks, sigma: float) -> Sums:
 
 def fit_plane_frame(blocks: Blocks, rough_normal: Array | None = None) -> PlaneFrame:
     """Plane through blocks by least squares along the beams, after one by distance (or with a normal known about)."""
-    origin = np.average(blocks.points, axis=0, weights=blocks.counts)
+    origin = blocks.counts @ blocks.points / blocks.counts.sum()
     if rough_normal is None:
         centred = (blocks.points - origin) * np.sqrt(blocks.counts)[:, None]
         rough_normal = np.linalg.eigh(centred.T @ centred)[1][:, 0]
     frame = PlaneFrame(origin, axes_of(rough_normal))
     for _ in range(2):
-        N, data, root = plane_rows(frame, blocks, 3)
-        root = root * np.sqrt(blocks.counts)
-        slopes = np.linalg.lstsq(N * root[:, None], data * root, rcond=1e-9)[0]
-        normal = frame.axes @ np.array([-slopes[1], -slopes[2], 1.0])
-        frame = PlaneFrame(frame.origin + slopes[0] * frame.axes[:, 2], axes_of(normal))
+        local = (blocks.points - frame.origin) @ frame.axes
+        sine = np.maximum(np.abs(blocks.directions @ frame.axes[:, 2]), GRAZING)
+        rows = np.stack([local[:, 0], local[:, 1], np.ones(len(local)), local[:, 2]])
+        s, t, offset = _least_squares((rows * (blocks.counts / (sine * sine))) @ rows.T)
+        frame = PlaneFrame(frame.origin + offset * frame.axes[:, 2], axes_of(frame.axes @ np.array([-s, -t, 1.0])))
     return frame
+
+
+def _least_squares(G: Array) -> Array:
+    """Best unknowns (..., k) by Gram matrices (..., k + 1, k + 1) of weighted rows and data; of those that the rows do
+    not tell, nearly the least.
+    """
+    A, b = G[..., :-1, :-1], G[..., :-1, -1:]
+    scale = 1.0 / np.sqrt(np.maximum(np.einsum("...ii->...i", A), 1e-300))[..., None]
+    A = A * scale * np.swapaxes(scale, -1, -2)
+    A += UNTOLD * np.eye(A.shape[-1])
+    return np.asarray((scale * np.linalg.solve(A, scale * b))[..., 0])
 
 
 def axes_of(normal: Array) -> Array:
     """(3, 3) columns s (level, or x where the normal is steep), t and the unit normal."""
-    n = normal / np.linalg.norm(normal)
-    level = np.array([-n[1], n[0], 0.0])
-    s = level if np.linalg.norm(level) > 0.5 else np.array([1.0, 0.0, 0.0])
-    s = s - (s @ n) * n
-    s /= np.linalg.norm(s)
-    return np.column_stack([s, np.cross(n, s), n])
+    x, y, z = (normal / math.sqrt(normal @ normal)).tolist()
+    # By plain numbers: called often, and numpy is slow with three.
+    a, b, c = (-y, x, 0.0) if math.hypot(x, y) > 0.5 else (1.0, 0.0, 0.0)
+    along = a * x + b * y + c * z
+    a, b, c = a - along * x, b - along * y, c - along * z
+    length = math.sqrt(a * a + b * b + c * c)
+    a, b, c = a / length, b / length, c / length
+    return np.array([[a, y * c - z * b, x], [b, z * a - x * c, y], [c, x * b - y * a, z]])
 
 
 def fit_cylinder_frame(blocks: Blocks) -> CylinderFrame | None:
     """Vertical cylinder through blocks; None where they lie on no circle."""
-    centre = np.average(blocks.points[:, :2], axis=0, weights=blocks.counts)
-    frame = CylinderFrame(centre, 1.0)
-    root = np.sqrt(blocks.counts)
+    circle = _circles(blocks.points.T[None, :2], blocks.directions.T[None, :2], blocks.counts)
+    return CylinderFrame(circle.centre[0], float(circle.radius[0])) if circle.good[0] else None
+
+
+class _Circles(NamedTuple):
+    """Circles through k times the same n points: centre (k, 2), radius (k,), good (k,): the others lie on none."""
+
+    centre: Array
+    radius: Array
+    good: NDArray[np.bool_]
+
+
+def _circles(points: Array, directions: Array, counts: Array) -> _Circles:
+    """Circles through points (k, 2, n) in k planes by least squares along the beams (k, 2, n); weights (n,)."""
+    middle = points @ counts / counts.sum()
+    rows = np.ones((len(points), 4, points.shape[2]))
+    np.subtract(points, middle[:, :, None], out=rows[:, :2])
+    rows[:, 3] = rows[:, 0] ** 2 + rows[:, 1] ** 2
+    # x^2 + y^2 = 2 a x + 2 b y + c about the middle. How the beams cross it is known once there is a circle.
+    reach = np.sum(rows[:, :2] * directions, axis=1)
+    weight = np.broadcast_to(counts, reach.shape)
+    centre, radius, good = np.zeros((len(points), 2)), np.zeros(len(points)), np.ones(len(points), dtype=bool)
     for step in range(4):
-        N, data, by_angle = cylinder_rows(frame, blocks)
-        weight = root if step == 0 else root * by_angle
-        a, b, c = np.linalg.lstsq(N * weight[:, None], data * weight, rcond=1e-9)[0]
-        square = c + a * a + b * b
-        if not 0.0025 < square < 25.0:
-            return None
-        frame = CylinderFrame(frame.centre + np.array([a, b]), float(np.sqrt(square)))
-    return frame
+        if step:
+            towards = np.sum(centre[:, :, None] * directions, axis=1)
+            weight = counts / np.maximum(np.abs(reach - towards), 2.0 * GRAZING * radius[:, None]) ** 2
+        x = _least_squares((rows * weight[:, None]) @ np.swapaxes(rows, 1, 2))
+        centre = x[:, :2] / 2.0
+        square = x[:, 2] + np.sum(centre**2, axis=1)
+        good &= (square > LEAST_RADIUS**2) & (square < LARGEST_RADIUS**2)
+        radius = np.sqrt(np.clip(square, LEAST_RADIUS**2, LARGEST_RADIUS**2))
+    return _Circles(middle + centre, radius, good)
 
 
 def turned(blocks: Blocks, axes: Array | None) -> Blocks:
@@ -166,38 +208,48 @@ def fit_axis(blocks: Blocks) -> Array | None:
     Directions all around are tried with a linear fit of the circle across them; from the best ones Gauss and Newton.
     """
     few, blocks = (blocks.pick(np.arange(0, len(blocks.counts), -(-len(blocks.counts) // n))) for n in ENOUGH_BLOCKS)
-    tried = [(found.misfit, k) for k, axis in enumerate(AXES) if (found := _lean(few, axes_of(axis))) is not None]
-    best, least = None, np.inf
-    for _, k in sorted(tried)[:BASINS]:
-        axes = axes_of(AXES[k])
-        for _ in range(TILTS):
-            found = _lean(blocks, axes)
-            if found is None:
-                break
-            if found.misfit < least:
-                best, least = axes, found.misfit
-            axes = axes_of(axes @ np.append(found.tilt, 1.0))
-    return best
+    frames = np.array([axes_of(axis) for axis in AXES])
+    order = np.argsort(_lean(few, frames).misfit, kind="stable")[:BASINS]
+    axes, misfit = _followed(few, frames[order])
+    axes, misfit = _followed(blocks, axes[[int(np.argmin(misfit))]])
+    return axes[0] if np.isfinite(misfit[0]) else None
+
+
+def _followed(blocks: Blocks, axes: Array) -> tuple[Array, Array]:
+    """The best of the frames (k, 3, 3) to which Gauss and Newton lead from each of `axes`, and its misfit (k,)."""
+    best, least = axes, np.full(len(axes), np.inf)
+    for _ in range(TILTS):
+        found = _lean(blocks, axes)
+        better = found.misfit < least
+        best, least = np.where(better[:, None, None], axes, best), np.where(better, found.misfit, least)
+        going = np.isfinite(found.misfit) & (np.abs(found.tilt).max(axis=1) > UPRIGHT)
+        if not going.any():
+            break
+        axes = np.array(
+            [axes_of(of @ (*tilt, 1.0)) if go else of for of, tilt, go in zip(axes, found.tilt, going, strict=True)]
+        )
+    return best, least
 
 
 class _Lean(NamedTuple):
-    """How badly a cylinder with a given axis fits, and by how much (2,) the axis should lean."""
+    """How badly cylinders with given axes fit (k,), inf: not at all; and by how much (k, 2) the axes should lean."""
 
-    misfit: float
+    misfit: Array
     tilt: Array
 
 
-def _lean(blocks: Blocks, axes: Array) -> _Lean | None:
-    blocks = turned(blocks, axes)
-    frame = fit_cylinder_frame(blocks)
-    if frame is None:
-        return None
-    xy = blocks.points[:, :2] - frame.centre
-    distance = np.linalg.norm(xy, axis=1)
+def _lean(blocks: Blocks, axes: Array) -> _Lean:
+    """The same of axes (k, 3, 3)."""
+    turns = np.swapaxes(axes, 1, 2)
+    points, across = turns @ blocks.points.T, turns[:, :2] @ blocks.directions.T
+    circle = _circles(points[:, :2], across, blocks.counts)
+    xy = points[:, :2] - circle.centre[:, :, None]
+    distance = np.sqrt(np.sum(xy * xy, axis=1))
     n = xy / np.maximum(distance, 1e-9)[:, None]
-    sine = np.abs(np.einsum("nk,nk->n", n, blocks.directions[:, :2]))
+    sine = np.abs(np.sum(n * across, axis=1))
     root = np.sqrt(blocks.counts) / np.maximum(sine, GRAZING)
-    z = blocks.points[:, 2] - blocks.points[:, 2].mean()
-    rows = np.column_stack([z[:, None] * n, n, np.ones(len(n))]) * root[:, None]
-    miss = (distance - frame.radius) * root
-    return _Lean(float(miss @ miss), np.linalg.lstsq(rows, miss, rcond=1e-9)[0][:2])
+    z = points[:, 2] - points[:, 2].mean(axis=1, keepdims=True)
+    miss = distance - circle.radius[:, None]
+    rows = np.concatenate([z[:, None] * n, n, np.ones_like(z)[:, None], miss[:, None]], axis=1) * root[:, None]
+    G = rows @ np.swapaxes(rows, 1, 2)
+    return _Lean(np.where(circle.good, G[:, 5, 5], np.inf), _least_squares(G)[:, :2])

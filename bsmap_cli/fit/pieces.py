@@ -5,7 +5,6 @@ the sensor, which follows gentle curves. With prefix sums of the moments the bes
 costs the same small work. Breaks are found by dynamic programming over candidates, then moved to their best place.
 """
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -33,6 +32,8 @@ radius.
 """
 WIDEST_GAP = 3
 """Beams without return that a piece may bridge."""
+ELEMENTS = 20_000
+"""Places, or pairs of them, worked on at once: their moments fit into the cache."""
 
 
 class Pieces(NamedTuple):
@@ -47,16 +48,8 @@ class Pieces(NamedTuple):
 def find_pieces(grid: BeamGrid) -> Pieces:
     """Pieces of all scan lines, scan after scan; what fits no line is in none."""
     moments = _prefix_moments(grid)
-    gain = _break_gain(moments)
-    found = []
-    for row in range(len(grid.ranges)):
-        places = [_candidates(grid, gain[:, row], row, *ends) for ends in _stretches(grid.hit[row])]
-        found += [(row, *piece) for piece in _divide(moments[:, row], places)]
-    if not found:
-        none = np.zeros(0, dtype=np.int64)
-        return Pieces(none, none, none, np.zeros(0, dtype=bool))
-    table = np.array(found, dtype=np.int64)
-    pieces = Pieces(table[:, 0], table[:, 1], table[:, 2], table[:, 3].astype(bool))
+    stretches = _stretches(grid.hit)
+    pieces = _divide(moments, stretches, _candidates(grid, _break_gain(moments), stretches))
     for _ in range(2):
         pieces = _relocate(grid, moments, pieces)
     return _shortened(grid, pieces)
@@ -66,7 +59,7 @@ def _prefix_moments(grid: BeamGrid) -> Array:
     """(11, m, n + 1) sums over beams before each: W {cc, cs, ss, c, s, 1}, W w {c, s, 1}, W w^2, number of returns."""
     m, n = grid.ranges.shape
     r = np.where(grid.hit, grid.ranges, 1.0)
-    W = np.where(grid.hit, r**4 / grid.sigma**2, 0.0)
+    W = np.where(grid.hit, (r * r / grid.sigma) ** 2, 0.0)
     w, c, s = 1.0 / r, np.cos(grid.angles), np.sin(grid.angles)
     terms = (W * c * c, W * c * s, W * s * s, W * c, W * s, W, W * w * c, W * w * s, W * w, W * w * w, grid.hit * 1.0)
     out = np.zeros((11, m, n + 1))
@@ -108,61 +101,116 @@ def _break_gain(moments: Array) -> Array:
     """(windows, m, n + 1) gain in chi square of a break before each beam, at several half windows."""
     _, m, places = moments.shape
     out = np.empty((len(WINDOWS), m, places))
-    at = np.arange(places)
-    of_lines = moments[OF_LINES]
-    for row in range(m):
-        here = of_lines[:, row]
+    widest = 2 * max(WINDOWS)
+    # Windows that reach beyond an end of the scan are cut there. So many scans at once fit into the cache.
+    at = np.clip(np.arange(-widest, places + widest), 0, places - 1)
+    step = max(1, ELEMENTS // len(at))
+    for rows in (slice(first, first + step) for first in range(0, m, step)):
+        here = moments[OF_LINES, rows][..., at]
+        intervals = {}
+        for length in sorted({*WINDOWS, *(2 * half for half in WINDOWS)}):
+            d = here[..., length:] - here[..., :-length]
+            intervals[length] = _chi_line_of(*d), d[6] >= 3
         for k, half in enumerate(WINDOWS):
-            low, high = np.maximum(at - half, 0), np.minimum(at + half, places - 1)
-            before, behind = here[:, low], here[:, high]
-            parts = np.stack([behind - before, here - before, behind - here], axis=1)
-            both, left, right = _chi_line_of(*parts)
-            enough = (parts[6, 1] >= 3) & (parts[6, 2] >= 3)
-            out[k, row] = np.where(enough, both - left - right, 0.0)
+            before, behind = slice(widest - half, widest - half + places), slice(widest, widest + places)
+            (chi, enough), (both, _) = intervals[half], intervals[2 * half]
+            gain = both[:, before] - chi[:, before] - chi[:, behind]
+            out[k, rows] = np.where(enough[:, before] & enough[:, behind], gain, 0.0)
     return out
 
 
-def _stretches(hit: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Ranges (first, stop) of beams between gaps too wide to bridge."""
-    at = np.flatnonzero(hit)
-    if len(at) == 0:
-        return []
-    wide = np.flatnonzero(np.diff(at) > WIDEST_GAP + 1)
-    first, last = np.concatenate([[0], wide + 1]), np.concatenate([wide, [len(at) - 1]])
-    return [(int(at[a]), int(at[b]) + 1) for a, b in zip(first, last, strict=True)]
+class _Stretches(NamedTuple):
+    """Beams between gaps too wide to bridge: row (k,), first beam (k,), beam behind the last one (k,)."""
+
+    row: IntArray
+    first: IntArray
+    stop: IntArray
 
 
-def _candidates(grid: BeamGrid, gain: Array, row: int, first: int, stop: int) -> IntArray:
-    """Places of possible breaks in a stretch, both ends among them: peaks of the gain, jumps of range."""
-    places = [np.array([first, stop])]
-    for half, g in zip(WINDOWS, gain[:, first : stop + 1], strict=True):
+def _stretches(hit: NDArray[np.bool_]) -> _Stretches:
+    """Stretches of all scans, scan after scan."""
+    row, column = np.nonzero(hit)
+    begins = (np.diff(row, prepend=-1) != 0) | (np.diff(column, prepend=0) > WIDEST_GAP + 1)
+    first = np.flatnonzero(begins)
+    return _Stretches(row[first], column[first], column[np.append(first[1:], len(row)) - 1] + 1)
+
+
+def _candidates(grid: BeamGrid, gain: Array, stretches: _Stretches) -> list[IntArray]:
+    """Places of possible breaks in each stretch, both ends among them: peaks of the gain, jumps of range."""
+    places = gain.shape[2]
+    length = stretches.stop - stretches.first + 1
+    of = np.repeat(np.arange(len(length)), length)
+    column = np.arange(len(of)) - np.repeat(np.cumsum(length) - length - stretches.first, length)
+    place = stretches.row[of] * places + column
+    is_end = (column == stretches.first[of]) | (column == stretches.stop[of])
+    chosen = is_end | _jumps(grid, stretches, of, column)
+    start, last = np.cumsum(length) - length, np.cumsum(length) - 1
+    for half, g in zip(WINDOWS, gain.reshape(len(gain), -1)[:, place], strict=True):
         reach = max(2, half // 4)
         high = np.flatnonzero(g > CANDIDATE)
-        around = np.clip(high[:, None] + np.arange(-reach, reach + 1), 0, len(g) - 1)
-        places.append(first + high[g[high] >= g[around].max(axis=1)])
-    step = np.abs(np.diff(grid.ranges[row, first:stop]))
-    known = step[np.isfinite(step)]
-    usual = np.median(known) if len(known) else 0.0
-    places.append(first + 1 + np.flatnonzero(step > 8.0 * grid.sigma + 3.0 * usual))
-    return np.unique(np.concatenate(places))
+        around = high + np.arange(-reach, reach + 1)[:, None]
+        around = np.clip(around, start[of[high]], last[of[high]])
+        chosen[high[g[high] >= g[around].max(axis=0)]] = True
+    return np.split(column[chosen], np.cumsum(np.bincount(of[chosen], minlength=len(length)))[:-1])
 
 
-def _divide(moments: Array, stretches: list[IntArray]) -> Iterator[tuple[int, int, bool]]:
+def _jumps(grid: BeamGrid, stretches: _Stretches, of: IntArray, column: IntArray) -> NDArray[np.bool_]:
+    """Which places (k,) of stretches `of` (k,) lie behind a step of range that is unusual there."""
+    row = stretches.row[of]
+    inner = (column > stretches.first[of]) & (column < stretches.stop[of])
+    step = np.full(len(of), np.nan)
+    step[inner] = np.abs(grid.ranges[row[inner], column[inner]] - grid.ranges[row[inner], column[inner] - 1])
+    known = np.isfinite(step)
+    # All medians by one sort: in front of the point the stretch, behind it the step.
+    scale = 1.0 + step[known].max(initial=0.0)
+    keys = np.sort(of[known] + step[known] / scale)
+    count = np.bincount(of[known], minlength=len(stretches.row))
+    start = np.cumsum(count) - count
+    some = np.flatnonzero(count)
+    usual = np.zeros(len(count))
+    middle = start[some] + (count[some] - 1) // 2, start[some] + count[some] // 2
+    usual[some] = ((keys[middle[0]] + keys[middle[1]]) / 2.0 - some) * scale
+    return np.asarray(step > 8.0 * grid.sigma + 3.0 * usual[of])
+
+
+def _divide(moments: Array, stretches: _Stretches, places: list[IntArray]) -> Pieces:
     """Cheapest division of stretches between their first and last places into lines, conics and junk.
 
-    moments : (11, n + 1) of the beams before each place of the scan.  stretches : places of possible breaks of each.
+    moments : (11, m, n + 1) of the beams before each place.  places : of possible breaks of each stretch.
     """
-    pairs = [np.triu_indices(len(places), 1) for places in stretches]
-    bounds = [(places[i], places[j]) for places, (i, j) in zip(stretches, pairs, strict=True)]
-    if not bounds:
-        return
-    low, high = (np.concatenate(of) for of in zip(*bounds, strict=True))
-    cost, kind = _prices(moments[:, high] - moments[:, low])
-    ends = np.cumsum([len(i) for i, _ in pairs])[:-1]
-    for places, (i, j), c, k in zip(stretches, pairs, np.split(cost, ends), np.split(kind, ends), strict=True):
-        costs, kinds = np.full((len(places), len(places)), np.inf), np.zeros((len(places), len(places)), dtype=int)
-        costs[j, i], kinds[j, i] = c, k
-        yield from _cheapest(places.tolist(), costs, kinds)
+    found: dict[int, list[tuple[int, int, bool]]] = {}
+    size = np.array([len(of) for of in places], dtype=np.int64)
+    # Together those with alike many places, as many as fit into the cache.
+    waiting = np.argsort(size, kind="stable")
+    while len(waiting):
+        count = max(1, int(np.searchsorted(np.arange(1, len(waiting) + 1) * size[waiting] ** 2, ELEMENTS)))
+        chunk, waiting = waiting[:count], waiting[count:]
+        made = _divide_alike(moments, stretches.row[chunk], [places[k] for k in chunk])
+        for k, pieces in zip(chunk.tolist(), made, strict=True):
+            found[k] = pieces
+    rows = stretches.row.tolist()
+    table = np.array([(rows[k], *piece) for k in range(len(rows)) for piece in found[k]], dtype=np.int64).reshape(-1, 4)
+    return Pieces(table[:, 0], table[:, 1], table[:, 2], table[:, 3].astype(bool))
+
+
+def _divide_alike(moments: Array, row: IntArray, places: list[IntArray]) -> list[list[tuple[int, int, bool]]]:
+    """Pieces of each of the stretches in scans `row` (k,), all at once."""
+    most = max(len(of) for of in places)
+    at = np.zeros((len(places), most), dtype=np.int64)
+    known = np.zeros(at.shape, dtype=bool)
+    for k, of in enumerate(places):
+        at[k, : len(of)], known[k, : len(of)] = of, True
+    i, j = np.triu_indices(most, 1)
+    stretch, pair = np.nonzero(known[:, j])
+    low, high = at[stretch, i[pair]], at[stretch, j[pair]]
+    cost, kind = _prices(moments[:, row[stretch], high] - moments[:, row[stretch], low])
+    costs = np.full((len(places), most, most), np.inf)
+    kinds = np.zeros(costs.shape, dtype=np.int64)
+    costs[stretch, j[pair], i[pair]], kinds[stretch, j[pair], i[pair]] = cost, kind
+    return [
+        _way(of.tolist(), before.tolist(), kind)
+        for of, before, kind in zip(places, _cheapest(costs), kinds, strict=True)
+    ]
 
 
 def _prices(d: Array) -> tuple[Array, IntArray]:
@@ -178,13 +226,20 @@ def _prices(d: Array) -> tuple[Array, IntArray]:
     return prices.min(axis=0), np.argmin(prices, axis=0)
 
 
-def _cheapest(places: list[int], costs: Array, kinds: IntArray) -> list[tuple[int, int, bool]]:
-    """Pieces of the cheapest way from the first of k places to the last; costs (k, k) to a place from those before."""
-    best, before = np.zeros(len(places)), [0] * len(places)
-    for k in range(1, len(places)):
-        total = best[:k] + costs[k, :k]
-        before[k] = int(total.argmin())
-        best[k] = total[before[k]]
+def _cheapest(costs: Array) -> IntArray:
+    """(s, k) the place before each on the cheapest way from the first; costs (s, k, k) to places from those before."""
+    best = np.zeros(costs.shape[:2])
+    before = np.zeros(costs.shape[:2], dtype=np.int64)
+    every = np.arange(len(costs))
+    for k in range(1, costs.shape[1]):
+        total = best[:, :k] + costs[:, k, :k]
+        before[:, k] = total.argmin(axis=1)
+        best[:, k] = total[every, before[:, k]]
+    return before
+
+
+def _way(places: list[int], before: list[int], kinds: IntArray) -> list[tuple[int, int, bool]]:
+    """Pieces of the way back from the last of k places; kinds (k, k) of what leads to a place from one before."""
     out, k = [], len(places) - 1
     while k > 0:
         b = before[k]

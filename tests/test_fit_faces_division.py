@@ -1,0 +1,67 @@
+"""Division of scan lines into pieces, all scans at once, against one interval or one way after the other."""
+
+import itertools
+
+import numpy as np
+from face_scenes import corridor_set
+
+from bsmap_cli.fit import pieces
+from bsmap_cli.fit.beams import make_grid
+
+
+def holed_grid():
+    """A grid of four scans with gaps of several widths, some to be bridged."""
+    grid = make_grid(corridor_set(scans=4).cloud, np.arange(4))
+    hit = grid.hit.copy()
+    hit[0, 100:103] = hit[1, 200:230] = hit[2, :50] = hit[3, 300] = False
+    return grid._replace(hit=hit, ranges=np.where(hit, grid.ranges, np.nan))
+
+
+def test_gain_of_a_break_is_that_of_two_lines_over_one():
+    moments = pieces._prefix_moments(holed_grid())
+    gain = pieces._break_gain(moments)
+    _, m, places = moments.shape
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        k, row, at = rng.integers(len(pieces.WINDOWS)), rng.integers(m), rng.integers(places)
+        low, high = max(at - pieces.WINDOWS[k], 0), min(at + pieces.WINDOWS[k], places - 1)
+        before, here, behind = (moments[:, row, place] for place in (low, at, high))
+        both, left, right = (pieces._chi_line(d[:, None])[0] for d in (behind - before, here - before, behind - here))
+        few = here[10] - before[10] < 3 or behind[10] - here[10] < 3
+        np.testing.assert_allclose(gain[k, row, at], 0.0 if few else both - left - right, atol=1e-6)
+
+
+def test_stretches_end_at_gaps_too_wide_to_bridge():
+    grid = holed_grid()
+    found = list(zip(*(of.tolist() for of in pieces._stretches(grid.hit)), strict=True))
+    assert found == [(0, 0, 541), (1, 0, 200), (1, 230, 541), (2, 50, 541), (3, 0, 541)]
+
+
+def test_candidates_are_peaks_and_jumps_of_each_stretch_alone():
+    grid = holed_grid()
+    gain, stretches = pieces._break_gain(pieces._prefix_moments(grid)), pieces._stretches(grid.hit)
+    for row, first, stop, found in zip(*stretches, pieces._candidates(grid, gain, stretches), strict=True):
+        step = np.abs(np.diff(grid.ranges[row, first:stop]))
+        expected = {first, stop}
+        limit = 8.0 * grid.sigma + 3.0 * np.median(step[np.isfinite(step)])
+        expected |= set((first + 1 + np.flatnonzero(step > limit)).tolist())
+        for half, g in zip(pieces.WINDOWS, gain[:, row], strict=True):
+            for at in range(first, stop + 1):
+                reach = max(2, half // 4)
+                around = g[max(first, at - reach) : min(stop, at + reach) + 1]
+                if g[at] > pieces.CANDIDATE and g[at] >= around.max():
+                    expected.add(at)
+        assert found.tolist() == sorted(expected)
+
+
+def test_the_cheapest_way_is_the_cheapest_of_all():
+    rng = np.random.default_rng(1)
+    costs = rng.uniform(size=(6, 7, 7)) * (1.0 + 3.0 * np.subtract.outer(np.arange(7), np.arange(7)) ** 2 / 36.0)
+    before = pieces._cheapest(costs)
+    for cost, back in zip(costs, before, strict=True):
+        ways = [(0, *between, 6) for count in range(6) for between in itertools.combinations(range(1, 6), count)]
+        best = min(ways, key=lambda way: sum(cost[b, a] for a, b in itertools.pairwise(way)))
+        found = [6]
+        while found[-1]:
+            found.append(int(back[found[-1]]))
+        assert found[::-1] == list(best)

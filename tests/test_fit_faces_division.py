@@ -1,12 +1,14 @@
-"""Division of scan lines into pieces, all scans at once, against one interval or one way after the other."""
+"""Division of scan lines into pieces, and block means, all at once, against one interval or one way after the other."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 from face_scenes import corridor_set
 
 from bsmap_cli.fit import pieces
 from bsmap_cli.fit.beams import make_grid
+from bsmap_cli.fit.blocks import FEWEST, LARGEST, LONGEST, make_blocks, single_beams
 
 
 def holed_grid():
@@ -14,7 +16,7 @@ def holed_grid():
     grid = make_grid(corridor_set(scans=4).cloud, np.arange(4))
     hit = grid.hit.copy()
     hit[0, 100:103] = hit[1, 200:230] = hit[2, :50] = hit[3, 300] = False
-    return grid._replace(hit=hit, ranges=np.where(hit, grid.ranges, np.nan))
+    return replace(grid, hit=hit, ranges=np.where(hit, grid.ranges, np.nan))
 
 
 def test_gain_of_a_break_is_that_of_two_lines_over_one():
@@ -65,3 +67,35 @@ def test_the_cheapest_way_is_the_cheapest_of_all():
         while found[-1]:
             found.append(int(back[found[-1]]))
         assert found[::-1] == list(best)
+
+
+def test_blocks_are_means_of_equal_shares_of_their_runs():
+    grid = holed_grid()
+    rng = np.random.default_rng(2)
+    row, start = rng.integers(4, size=60), rng.integers(480, size=60)
+    stop = start + rng.integers(1, 60, 60)
+    blocks, beams = make_blocks(grid, row, start, stop), single_beams(grid, row, start, stop)
+    at = single = 0
+    for k, (r, a, b) in enumerate(zip(row, start, stop, strict=True)):
+        seen = a + np.flatnonzero(grid.hit[r, a:b])
+        one = slice(single, single + len(seen))
+        single += len(seen)
+        np.testing.assert_array_equal(beams.points[one], grid.points[r, seen])
+        np.testing.assert_array_equal(beams.directions[one], grid.directions[r, seen])
+        assert np.all(beams.owner[one] == k)
+        assert np.all(beams.row[one] == r)
+        np.testing.assert_array_equal(beams.column[one], seen)
+        if not len(seen):
+            continue
+        metres = np.linalg.norm(grid.points[r, seen[-1]] - grid.points[r, seen[0]])
+        share = min(max(int(np.ceil(max((b - a) / LARGEST, metres / LONGEST))), FEWEST), b - a)
+        for part in range(share):
+            mine = seen[(seen - a) * share // (b - a) == part]
+            if len(mine):
+                np.testing.assert_allclose(blocks.points[at], grid.points[r, mine].mean(axis=0), atol=1e-11)
+                way = grid.directions[r, mine].mean(axis=0)
+                np.testing.assert_allclose(blocks.directions[at], way / np.linalg.norm(way), atol=1e-11)
+                assert (blocks.counts[at], blocks.row[at], blocks.owner[at]) == (len(mine), r, k)
+                np.testing.assert_allclose(blocks.column[at], mine.mean(), atol=1e-9)
+                at += 1
+    assert (at, single) == (len(blocks.counts), len(beams.counts))

@@ -1,5 +1,7 @@
 """Faces at large noise: beams of narrow faces not in their neighbours, errors and covariance near the limit."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from face_scenes import corridor_set
@@ -59,7 +61,7 @@ def test_beams_that_miss_a_face_together_leave_it():
     moved = grid.points.copy()
     patch = np.s_[row - 2 : row + 3, column - 2 : column + 3]
     moved[patch] += 3.0 * faces.sigma * grid.directions[patch]
-    grid = grid._replace(points=moved)
+    grid = replace(grid, points=moved)
     labels = without_alike(grid, find_misses(grid, faces.labels, fields), faces.sigma)
     assert np.all(labels[row - 1 : row + 2, column - 1 : column + 2] == -1)
     assert np.count_nonzero(labels != faces.labels) < 40
@@ -81,7 +83,7 @@ def test_last_beam_that_misses_its_face_towards_the_jump_behind_it_leaves_it():
     labels[row, column + 1] = -1
     for miss, leaves in ((0.03, True), (-0.03, False), (0.01, False)):
         points[row, column] -= miss * grid.directions[row, column]
-        moved = grid._replace(points=points)
+        moved = replace(grid, points=points)
         after = without_slipped_ends(moved, find_misses(moved, labels, fields), fields, faces.sigma)
         assert (after[row, column] == -1) == leaves
         points[row, column] += miss * grid.directions[row, column]
@@ -96,7 +98,7 @@ def test_beam_that_only_grazes_a_face_misses_it():
     directions = grid.directions.copy()
     along = directions[row, column] - (directions[row, column] @ normal) * normal
     directions[row, column] = along / np.linalg.norm(along)
-    misses = find_misses(grid._replace(directions=directions), faces.labels, [f.field for f in faces.fitted])
+    misses = find_misses(replace(grid, directions=directions), faces.labels, [f.field for f in faces.fitted])
     assert np.isinf(misses.beyond[row, column])
     assert np.count_nonzero(np.isinf(misses.beyond)) == 1
 

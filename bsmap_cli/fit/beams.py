@@ -1,5 +1,7 @@
 """The beams of a data set as a grid of scans and beams: points, directions, ranges."""
 
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +11,20 @@ from bsmap_cli.core.beams import beam_origins
 from bsmap_cli.model import Array, IntArray, PointCloud
 
 
-class BeamGrid(NamedTuple):
+class Sums(NamedTuple):
+    """Of the returns before each beam of a grid of m scans of n beams.
+
+    number : (m n + 1,) of them in the grid before each beam, scan after scan.  place : (k,) flat index of each return.
+    sums : (m, n + 1, 7) of their points, directions and beam numbers in the scan before each beam.
+    """
+
+    number: IntArray
+    place: IntArray
+    sums: Array
+
+
+@dataclass(frozen=True, eq=False)
+class BeamGrid:
     """Beams of m scans, n each; nan where nothing came back.
 
     points : (m, n, 3) in map.  directions : (m, n, 3) unit vectors of the beams in map.  ranges : (m, n) metres.
@@ -23,6 +38,20 @@ class BeamGrid(NamedTuple):
     angles: Array
     hit: NDArray[np.bool_]
     sigma: float
+
+    @cached_property
+    def before(self) -> Sums:
+        """Sums of returns, added up once: then the mean of any stretch of beams is had from its two ends."""
+        m, n = self.hit.shape
+        number = np.zeros(m * n + 1, dtype=np.int64)
+        np.cumsum(self.hit.ravel(), out=number[1:])
+        sums = np.zeros((m, n + 1, 7))
+        seen = self.hit[:, :, None]
+        sums[:, 1:, :3] = np.where(seen, self.points, 0.0)
+        sums[:, 1:, 3:6] = np.where(seen, self.directions, 0.0)
+        sums[:, 1:, 6] = self.hit * np.arange(n)
+        np.cumsum(sums, axis=1, out=sums)
+        return Sums(number, np.flatnonzero(self.hit), sums)
 
 
 def make_grid(cloud: PointCloud, scans: IntArray) -> BeamGrid:

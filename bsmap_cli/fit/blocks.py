@@ -34,37 +34,49 @@ class Blocks(NamedTuple):
     column: Array
     owner: IntArray
 
-    def pick(self, keep: IntArray | NDArray[np.bool_]) -> "Blocks":
-        """The blocks that an index or a mask (k,) names."""
+    def pick(self, keep: IntArray | NDArray[np.bool_] | slice) -> "Blocks":
+        """The blocks that an index, a mask (k,) or a slice names."""
         points, directions, counts, row, column, owner = self
         return Blocks(points[keep], directions[keep], counts[keep], row[keep], column[keep], owner[keep])
 
 
-def make_blocks(grid: BeamGrid, row: IntArray, start: IntArray, stop: IntArray, largest: int = LARGEST) -> Blocks:
+def make_blocks(grid: BeamGrid, row: IntArray, start: IntArray, stop: IntArray) -> Blocks:
     """Blocks of runs of beams: row (k,), first beam (k,), beam behind the last one (k,)."""
-    length = stop - start
     n = grid.ranges.shape[1]
-    position = np.arange(int(length.sum())) - np.repeat(np.cumsum(length) - length, length)
-    flat = np.repeat(row * n + start, length) + position
-    owner = np.repeat(np.arange(len(row)), length)
-    hit = grid.hit.ravel()[flat]
-    flat, owner, position = flat[hit], owner[hit], position[hit]
-    if len(flat) == 0:
-        none = np.zeros(0, dtype=np.int64)
-        return Blocks(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), none, np.zeros(0), none)
-    points = grid.points.reshape(-1, 3)[flat]
+    number, place, sums = grid.before
+    some = np.flatnonzero(number[row * n + stop] > number[row * n + start])
+    row, start, length = row[some], start[some], (stop - start)[some]
+    first, last = (place[number[row * n + end] - k] for end, k in ((start, 0), (stop[some], 1)))
+    points = grid.points.reshape(-1, 3)
+    metres = np.sqrt(np.sum((points[last] - points[first]) ** 2, axis=1))
     # Equal shares of a run: as many blocks as the number of beams, or the length in metres, asks for.
-    ends = np.zeros((len(row), 2, 3))
-    ends[owner[::-1], 0], ends[owner, 1] = points[::-1], points
-    metres = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
-    share = np.ceil(np.maximum(length / largest, metres / LONGEST)).astype(np.int64).clip(FEWEST)
-    number = position * np.minimum(share, length)[owner] // length[owner]
-    first = np.flatnonzero((np.diff(owner, prepend=-1) != 0) | (np.diff(number, prepend=-1) != 0))
-    counts = np.diff(np.append(first, len(flat))).astype(float)
-    mean = np.add.reduceat(np.column_stack([points, grid.directions.reshape(-1, 3)[flat], flat % n]), first, axis=0)
-    mean /= counts[:, None]
-    directions = mean[:, 3:6] / np.linalg.norm(mean[:, 3:6], axis=1, keepdims=True)
-    return Blocks(mean[:, :3], directions, counts, flat[first] // n, mean[:, 6], owner[first])
+    share = np.ceil(np.maximum(length / LARGEST, metres / LONGEST)).astype(np.int64).clip(FEWEST)
+    share = np.minimum(share, length)
+    of = np.repeat(np.arange(len(share)), share)
+    part = np.arange(len(of)) - np.repeat(np.cumsum(share) - share, share)
+    low, high = (start[of] - -k * length[of] // share[of] for k in (part, part + 1))
+    counts = number[row[of] * n + high] - number[row[of] * n + low]
+    seen = np.flatnonzero(counts)
+    of, low, high, counts = of[seen], low[seen], high[seen], counts[seen].astype(np.float64)
+    mean = (sums[row[of], high] - sums[row[of], low]) / counts[:, None]
+    return Blocks(mean[:, :3], _unit(mean[:, 3:6]), counts, row[of], mean[:, 6], some[of])
+
+
+def single_beams(grid: BeamGrid, row: IntArray, start: IntArray, stop: IntArray) -> Blocks:
+    """The beams of runs, each for itself: row (k,), first beam (k,), beam behind the last one (k,)."""
+    n = grid.ranges.shape[1]
+    number, place, _ = grid.before
+    first = number[row * n + start]
+    count = number[row * n + stop] - first
+    flat = place[np.arange(count.sum()) + np.repeat(first - np.cumsum(count) + count, count)]
+    points, directions = (of.reshape(-1, 3)[flat] for of in (grid.points, grid.directions))
+    return Blocks(
+        points, directions, np.ones(len(flat)), flat // n, flat % n * 1.0, np.repeat(np.arange(len(row)), count)
+    )
+
+
+def _unit(vectors: Array) -> Array:
+    return vectors / np.sqrt(np.sum(vectors**2, axis=1, keepdims=True))
 
 
 def thinned(blocks: Blocks) -> Blocks:
@@ -88,6 +100,5 @@ def thinned(blocks: Blocks) -> Blocks:
     counts = np.add.reduceat(weight, first)
     values = np.column_stack([blocks.points, blocks.directions, blocks.column])[order]
     mean = np.add.reduceat(values * weight[:, None], first) / counts[:, None]
-    directions = mean[:, 3:6] / np.linalg.norm(mean[:, 3:6], axis=1, keepdims=True)
     head = order[first]
-    return Blocks(mean[:, :3], directions, counts, blocks.row[head], mean[:, 6], blocks.owner[head])
+    return Blocks(mean[:, :3], _unit(mean[:, 3:6]), counts, blocks.row[head], mean[:, 6], blocks.owner[head])

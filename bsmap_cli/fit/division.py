@@ -1,5 +1,6 @@
 """Faces of a data set: beams divided into smooth surfaces, each fitted as a height field over its own base."""
 
+import itertools
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -8,11 +9,12 @@ from numpy.typing import NDArray
 
 from bsmap_cli.fit.absorption import absorb
 from bsmap_cli.fit.beams import BeamGrid
-from bsmap_cli.fit.blocks import LARGEST, Blocks, make_blocks, thinned
+from bsmap_cli.fit.blocks import Blocks, make_blocks, single_beams, thinned
 from bsmap_cli.fit.clutter import find_planes
 from bsmap_cli.fit.crossings import find_crossings
 from bsmap_cli.fit.heights import Base, CylinderBase, HeightField, PlaneBase, plane_base
 from bsmap_cli.fit.labels import (
+    Runs,
     adopt,
     fill,
     find_misses,
@@ -97,7 +99,7 @@ def _widened(grid: BeamGrid, labels: IntArray, fitted: list[Fitted], sigma: floa
     """
     crossings = find_crossings(grid, labels, [f.field for f in fitted])
     out = []
-    pairs = zip(blocks_of_faces(grid, labels), blocks_of_faces(grid, labels, 1), strict=True)
+    pairs = zip(blocks_of_faces(grid, labels), _beams_of_faces(grid, labels), strict=True)
     for number, (old, (blocks, beams)) in enumerate(zip(fitted, pairs, strict=True)):
         field = old.field
         curved = field.knots.size > 4 and len(beams.counts) * field.knots.size < MOST_ROWS
@@ -140,13 +142,24 @@ def _kept(labels: IntArray, grid: BeamGrid) -> tuple[IntArray, IntArray]:
     return new[labels], kept
 
 
-def blocks_of_faces(grid: BeamGrid, labels: IntArray, largest: int = LARGEST) -> list[Blocks]:
-    """Blocks of each face, of up to `largest` beams of a scan; single beams stay single where scans are close, too."""
+def blocks_of_faces(grid: BeamGrid, labels: IntArray) -> list[Blocks]:
+    """Blocks of each face."""
     runs = runs_of(labels)
-    blocks = make_blocks(grid, runs.row, runs.start, runs.stop, largest)
-    of_face = runs.label[blocks.owner]
-    picked = [blocks.pick(of_face == k) for k in range(int(labels.max(initial=-1)) + 1)]
-    return picked if largest < LARGEST else [thinned(one) for one in picked]
+    return [thinned(one) for one in _by_face(make_blocks(grid, runs.row, runs.start, runs.stop), runs)]
+
+
+def _beams_of_faces(grid: BeamGrid, labels: IntArray) -> list[Blocks]:
+    """Beams of each face; single ones stay single where scans are close, too."""
+    runs = runs_of(labels)
+    return _by_face(single_beams(grid, runs.row, runs.start, runs.stop), runs)
+
+
+def _by_face(blocks: Blocks, runs: Runs) -> list[Blocks]:
+    """The blocks of runs, face by face."""
+    face = runs.label[blocks.owner]
+    blocks = blocks.pick(np.argsort(face, kind="stable"))
+    ends = np.cumsum(np.bincount(face, minlength=int(runs.label.max(initial=-1)) + 1)).tolist()
+    return [blocks.pick(slice(a, b)) for a, b in itertools.pairwise([0, *ends])]
 
 
 def _fit_all(grid: BeamGrid, labels: IntArray, sigma: float) -> list[Fitted]:

@@ -7,6 +7,7 @@ And the cells between two scans do not reach through a face in which one of the 
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -62,7 +63,7 @@ def on_faces(grid: BeamGrid, labels: IntArray, feet: Sequence[Feet]) -> BeamGrid
     points = grid.points.copy()
     for number, of_face in enumerate(feet):
         points[(labels == number) & grid.hit] = of_face.points
-    return grid._replace(points=points)
+    return replace(grid, points=points)
 
 
 def within_ends(grid: BeamGrid, labels: IntArray, table: Table, crossings: Crossings, ends: Ends) -> Crossings:

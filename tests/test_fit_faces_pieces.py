@@ -78,6 +78,13 @@ def test_many_faces_at_once_give_the_feet_and_offsets_of_each():
     directions = rng.normal(size=(3000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     feet = find_feet(tabulate(every), face, points, directions, steps=1)
+    # Short lists are taken beam by beam, long ones face by face.
+    for steps in (1, 4):
+        long = find_feet(tabulate(every), face, points, directions, steps=steps)
+        short = find_feet(tabulate(every), face[:500], points[:500], directions[:500], steps=steps)
+        good = np.abs(short.slope) > 0.2
+        for one, other in zip(short, long, strict=True):
+            np.testing.assert_allclose(one[good], other[:500][good], atol=1e-12 if steps == 1 else 1e-5)
     value, normal = offsets(tabulate(every), face, points)
     for number, field in enumerate(every):
         of = face == number

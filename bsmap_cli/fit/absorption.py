@@ -7,7 +7,7 @@ from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.clutter import INCIDENCE
 from bsmap_cli.fit.feet import Table, tabulate
 from bsmap_cli.fit.heights import HeightField
-from bsmap_cli.fit.labels import ADOPTED, feet_at
+from bsmap_cli.fit.labels import ADOPTED, met_at
 from bsmap_cli.fit.pieces import JUNK_BEAM
 from bsmap_cli.fit.selection import PRICE
 from bsmap_cli.model import Array, IntArray
@@ -46,8 +46,8 @@ def _chi(grid: BeamGrid, table: Table, faces: IntArray, mask: NDArray[np.bool_],
     """(f, k) chi square of the beams of a mask to faces (f,), at most that of junk, where the face may reach them."""
     row, column = np.nonzero(mask)
     face = np.repeat(faces, len(row))
-    feet = feet_at(grid, table, face, np.tile(row, len(faces)), np.tile(column, len(faces)))
+    met = met_at(grid, table, face, np.tile(row, len(faces)), np.tile(column, len(faces)))
     room = (REACH / table.size).T[face]
-    near = np.all((feet.uv > -room) & (feet.uv < 1.0 + room), axis=1) & (np.abs(feet.slope) > INCIDENCE)
-    chi = np.where(near, np.minimum((feet.beyond / sigma) ** 2, JUNK_BEAM), JUNK_BEAM)
+    near = np.all((met.uv > -room) & (met.uv < 1.0 + room), axis=1) & (np.abs(met.slope) > INCIDENCE)
+    chi = np.where(near, np.minimum((met.beyond / sigma) ** 2, JUNK_BEAM), JUNK_BEAM)
     return np.asarray(chi.reshape(len(faces), -1))

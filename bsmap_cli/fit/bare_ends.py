@@ -14,7 +14,7 @@ from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.ends import THROUGH, Ends
 from bsmap_cli.fit.feet import tabulate
 from bsmap_cli.fit.heights import HeightField
-from bsmap_cli.fit.labels import OUTLIER, feet_at
+from bsmap_cli.fit.labels import OUTLIER, met_at
 from bsmap_cli.fit.outline import CORNERS
 from bsmap_cli.model import IntArray
 
@@ -64,8 +64,8 @@ def _bare(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], ends:
     first = np.unique(row * n + last, return_index=True)[1]
     first = first[ended[first]]
     face = labels[row[first], column[first]]
-    feet = feet_at(grid, tabulate(fields), face, row[first], following[first])
-    behind[row[first], last[first]] = feet.beyond < -BEHIND - OUTLIER * grid.sigma
+    met = met_at(grid, tabulate(fields), face, row[first], following[first])
+    behind[row[first], last[first]] = met.beyond < -BEHIND - OUTLIER * grid.sigma
     out = np.zeros((m, n), dtype=bool)
     out[row, column] = behind[row, last]
     return out

@@ -14,6 +14,7 @@ from bsmap_cli.fit.clutter import find_planes
 from bsmap_cli.fit.crossings import find_crossings
 from bsmap_cli.fit.heights import Base, CylinderBase, HeightField, PlaneBase, plane_base
 from bsmap_cli.fit.labels import (
+    Misses,
     Runs,
     adopt,
     fill,
@@ -69,9 +70,10 @@ def find_faces(grid: BeamGrid) -> Faces:
     labels = _renumber(labels, grid)
     fitted = _fit_all(grid, labels, sigma)
     rng = np.random.default_rng(0)
+    misses = None
     for step in range(ROUNDS):
         fields = [f.field for f in fitted]
-        misses = find_misses(grid, labels, fields)
+        misses = find_misses(grid, labels, fields, before=misses)
         divided = adopt(grid, without_outliers(misses, sigma), fields, sigma)
         divided = move_breaks(grid, divided, fields, sigma)
         misses = find_misses(grid, divided, fields, misses)
@@ -86,7 +88,7 @@ def find_faces(grid: BeamGrid) -> Faces:
         else:
             labels, kept = _kept(divided, grid)
             fitted = _refit_all(grid, labels, [fields[k] for k in kept], sigma)
-    labels, kept = _believed(grid, labels, [f.field for f in fitted], sigma)
+    labels, kept = _believed(grid, labels, [f.field for f in fitted], misses, sigma)
     fitted = [fitted[k] for k in kept]
     return Faces(labels, _widened(grid, labels, fitted, sigma), sigma)
 
@@ -117,9 +119,11 @@ def _widened(grid: BeamGrid, labels: IntArray, fitted: list[Fitted], sigma: floa
     return out
 
 
-def _believed(grid: BeamGrid, labels: IntArray, fields: list[HeightField], sigma: float) -> tuple[IntArray, IntArray]:
+def _believed(
+    grid: BeamGrid, labels: IntArray, fields: list[HeightField], known: Misses | None, sigma: float
+) -> tuple[IntArray, IntArray]:
     """Labels without outliers, nor the faces that many beams deny; and the numbers of the others."""
-    final = without_outliers(find_misses(grid, labels, fields), sigma)
+    final = without_outliers(find_misses(grid, labels, fields, before=known), sigma)
     for number in range(len(fields)):
         before, after = (int(np.count_nonzero((a == number) & grid.hit)) for a in (labels, final))
         if after < BELIEVED * before:

@@ -10,12 +10,21 @@ from bsmap_cli.core.pieces import CHUNK, Spans, horner
 from bsmap_cli.fit.heights import CylinderBase, HeightField
 from bsmap_cli.model import Array, IntArray
 
-SETTLED = 1e-4
-"""Metres; behind a step of Newton's method below this what is left is its square times the curvature."""
+SETTLED = 5e-4
+"""Metres; behind a step of Newton's method below this what is left is its square times the curvature: micrometres."""
 STEEPEST = 0.05
 """Smallest sine between beam and surface that counts."""
 FARTHEST = 5.0
 """Metres that a step of Newton's method may go."""
+
+
+class Met(NamedTuple):
+    """The same as Feet, without their points."""
+
+    uv: Array
+    beyond: Array
+    slope: Array
+    height: Array
 
 
 class Feet(NamedTuple):
@@ -110,25 +119,40 @@ def find_feet(
 
     start : (n,) metres from the points at which it begins, 0 where not given.
     """
-    uv, rest = np.empty((2, len(points))), np.empty((3, len(points)))
-    for part, faces in _chunks(face):
-        p, d = np.ascontiguousarray(points[part].T), np.ascontiguousarray(directions[part].T)
+    met = meet(table, face, points, directions, None, start, steps)
+    return Feet(met.uv, met.beyond, met.slope, points + met.beyond[:, None] * directions, met.height)
+
+
+def meet(
+    table: Table,
+    face: IntArray,
+    points: Array,
+    directions: Array,
+    at: IntArray | None = None,
+    start: Array | None = None,
+    steps: int = 4,
+) -> Met:
+    """The same without points, of those beams that are numbered `at` (n,) among points and directions (k, 3)."""
+    uv, rest = np.empty((2, len(face))), np.empty((3, len(face)))
+    for part, faces in _chunks(face, len(table.radius)):
+        p, d = (np.ascontiguousarray(of[part if at is None else at[part]].T) for of in (points, directions))
         begin = np.zeros(p.shape[1]) if start is None else start[part]
-        uv[:, part], rest[:, part] = _newton(table, faces, p, d, begin, steps)
-    beyond, slope, height = rest
-    return Feet(uv.T, beyond, slope, points + beyond[:, None] * directions, height)
+        alone = len(faces) == 1 and table.least[faces[0]] < 0.0 and not table.radius[faces[0]]
+        uv[:, part], rest[:, part] = (_on_bilinear if alone else _newton)(table, faces, p, d, begin, steps)
+    return Met(uv.T, *rest)
 
 
-def _chunks(face: IntArray) -> Iterator[tuple[slice | IntArray, IntArray]]:
-    """Parts of the beams on faces (n,) that fit into the processor's cache, with their faces.
+def _chunks(face: IntArray, faces: int) -> Iterator[tuple[slice | IntArray, IntArray]]:
+    """Parts of the beams on `face` (n,) of so many that fit into the processor's cache, with their faces.
 
     Long lists are taken face by face: where a part has only one face, that is given once, and its tables need not be
     copied for every beam.
     """
     if len(face) <= CHUNK:
-        yield slice(None), face
+        yield slice(None), face[:1] if faces == 1 else face
         return
-    order = np.argsort(face.astype(np.int32), kind="stable")
+    # Short numbers are sorted in one pass.
+    order = np.argsort(face.astype(np.int16 if faces < 2**15 else np.int64), kind="stable")
     ordered = face[order]
     for a, b in itertools.pairwise([0, *(np.flatnonzero(np.diff(ordered)) + 1).tolist(), len(face)]):
         for first in range(a, b, CHUNK):
@@ -153,9 +177,8 @@ def offsets(table: Table, face: IntArray, points: Array) -> tuple[Array, Array]:
 
 def _newton(table: Table, face: IntArray, p: Array, d: Array, start: Array, steps: int) -> tuple[Array, Array]:
     """(2, n) parameters; (3, n) way beyond the points, slope and height, of beams p, d (3, n)."""
-    frame = table.frame.take(face, axis=1)
     # Over a plane s, t and h change evenly along a beam.
-    flat, turn = _turned(frame, p - frame[9:]), _turned(frame, d)
+    flat, turn = _in_frames(table, face, p, d)
     at, arm = _round_ones(table, face, p.shape[1])
     every = np.broadcast_to(face, p.shape[1])
     ahead = turn[:, at]
@@ -169,14 +192,52 @@ def _newton(table: Table, face: IntArray, p: Array, d: Array, start: Array, step
             turn[:, at] = (dy * c - dx * s) * stretch, dz, dx * c + dy * s
         height, gradient, uv = _heights(table, face, local)
         climb = gradient[0] * turn[0] + gradient[1] * turn[1]
-        slope = turn[2] - climb
-        slope = np.where(np.abs(slope) < STEEPEST, np.where(slope < 0.0, -STEEPEST, STEEPEST), slope)
+        slope = _steep(turn[2] - climb)
         move = np.clip((local[2] - height) / slope, -FARTHEST, FARTHEST)
         beyond -= move
         if step == steps - 1 or np.abs(move).max(initial=0.0) < SETTLED:
             break
     uv -= move * turn[:2] / table.size.take(face, axis=1)
     return uv, np.stack([beyond, slope, height - move * climb])
+
+
+def _on_bilinear(table: Table, face: IntArray, p: Array, d: Array, start: Array, steps: int) -> tuple[Array, Array]:
+    """The same on the least surface over a plane, (1,) face: along a beam its height is a polynomial of degree 2."""
+    flat, turn = _in_frames(table, face, p, d)
+    (a, b), (c, twist) = table.coefficients[:2, :2, table.first_piece[face[0]]].tolist()
+    low, size = table.low[:, face], table.size[:, face]
+    # The coefficients are those about the middle, whose own parameters run from -1 to 1.
+    x, y = (flat[:2] - low) * (2.0 / size) - 1.0
+    dx, dy = turn[:2] * (2.0 / size)
+    above = flat[2] - (a + b * x + y * (c + twist * x))
+    rise = turn[2] - (b + twist * y) * dx - (c + twist * x) * dy
+    bend = -twist * dx * dy
+    beyond = start
+    for step in range(steps):
+        bent = bend * beyond
+        raw = rise + 2.0 * bent
+        off = above + beyond * (rise + bent)
+        slope = _steep(raw)
+        move = np.clip(off / slope, -FARTHEST, FARTHEST)
+        before, beyond = beyond, beyond - move
+        if step == steps - 1 or np.abs(move).max(initial=0.0) < SETTLED:
+            break
+    uv = 0.5 * (np.stack([x + beyond * dx, y + beyond * dy]) + 1.0)
+    return uv, np.stack([beyond, slope, flat[2] + before * turn[2] - off - move * (turn[2] - raw)])
+
+
+def _steep(slope: Array) -> Array:
+    """Slopes (n,), those that are too small made greater."""
+    return np.copysign(np.maximum(np.abs(slope), STEEPEST), slope)
+
+
+def _in_frames(table: Table, face: IntArray, p: Array, d: Array) -> tuple[Array, Array]:
+    """Points and directions (3, n) in the frames of their faces (n,), or of one (1,)."""
+    frame = table.frame.take(face, axis=1)
+    if len(face) == 1:
+        axes = frame[:9].reshape(3, 3)
+        return axes @ (p - frame[9:]), axes @ d
+    return _turned(frame, p - frame[9:]), _turned(frame, d)
 
 
 def _turned(frame: Array, vectors: Array) -> Array:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.context import FLATNESS
-from bsmap_cli.fit.feet import STEEPEST, Feet, Table, find_feet, tabulate
+from bsmap_cli.fit.feet import STEEPEST, Feet, Met, Table, find_feet, meet, tabulate
 from bsmap_cli.fit.heights import HeightField
 from bsmap_cli.model import Array, IntArray
 
@@ -48,24 +48,26 @@ def runs_of(labels: IntArray) -> Runs:
     return Runs(row[keep], start[keep], (stop - row * n)[keep], label[keep])
 
 
-def feet_at(grid: BeamGrid, table: Table, face: IntArray, row: IntArray, column: IntArray) -> Feet:
-    """Feet of beams (k,) on the faces (k,) of a table."""
-    return find_feet(table, face, grid.points[row, column], grid.directions[row, column])
+def met_at(
+    grid: BeamGrid, table: Table, face: IntArray, row: IntArray, column: IntArray, start: Array | None = None
+) -> Met:
+    """Where beams (k,) meet the faces (k,) of a table; start: metres (k,) beyond their ends where to look first."""
+    points, directions = grid.points.reshape(-1, 3), grid.directions.reshape(-1, 3)
+    return meet(table, face, points, directions, row * grid.hit.shape[1] + column, start)
 
 
 def feet_of(grid: BeamGrid, field: HeightField, mask: NDArray[np.bool_]) -> Feet:
     """Feet of the beams of a mask (m, n) on a height field."""
-    row, column = np.nonzero(mask)
-    return feet_at(grid, tabulate([field]), np.zeros(len(row), dtype=np.int64), row, column)
+    return find_feet(tabulate([field]), np.zeros(mask.sum(), dtype=np.int64), grid.points[mask], grid.directions[mask])
 
 
 def feet_of_faces(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField]) -> list[Feet]:
     """Feet of the beams of each face that have a return, in the order of the grid."""
-    row, column = np.nonzero((labels >= 0) & grid.hit)
-    face = labels[row, column]
-    order = np.argsort(face, kind="stable")
-    feet = feet_at(grid, tabulate(fields), face[order], row[order], column[order])
-    bounds = np.searchsorted(face[order], np.arange(len(fields) + 1))
+    at = np.flatnonzero((labels >= 0) & grid.hit)
+    at = at[np.argsort(labels.ravel()[at], kind="stable")]
+    face = labels.ravel()[at]
+    feet = find_feet(tabulate(fields), face, grid.points.reshape(-1, 3)[at], grid.directions.reshape(-1, 3)[at])
+    bounds = np.searchsorted(face, np.arange(len(fields) + 1))
     return [Feet(*(of[a:b] for of in feet)) for a, b in itertools.pairwise(bounds.tolist())]
 
 
@@ -79,15 +81,28 @@ class Misses(NamedTuple):
     beyond: Array
 
 
-def find_misses(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], known: Misses | None = None) -> Misses:
-    """How all beams miss their faces; known: the same for other labels, which is kept where these agree."""
+def find_misses(
+    grid: BeamGrid,
+    labels: IntArray,
+    fields: Sequence[HeightField],
+    known: Misses | None = None,
+    before: Misses | None = None,
+) -> Misses:
+    """How all beams miss their faces.
+
+    known : the same for other labels, which is kept where these agree.  before : the same for fields near these ones.
+    """
     beyond = np.zeros(labels.shape) if known is None else np.where(labels >= 0, known.beyond, 0.0)
     new = (labels >= 0) & grid.hit
     if known is not None:
         new &= labels != known.labels
     row, column = np.nonzero(new)
-    feet = feet_at(grid, tabulate(fields), labels[row, column], row, column)
-    beyond[row, column] = np.where(np.abs(feet.slope) > STEEPEST, feet.beyond, np.inf)
+    start = None
+    if before is not None:
+        start = np.where(before.labels[row, column] >= 0, before.beyond[row, column], 0.0)
+        start[~np.isfinite(start)] = 0.0
+    met = met_at(grid, tabulate(fields), labels[row, column], row, column, start)
+    beyond[row, column] = np.where(np.abs(met.slope) > STEEPEST, met.beyond, np.inf)
     return Misses(labels, beyond)
 
 
@@ -130,10 +145,10 @@ def without_slipped_ends(grid: BeamGrid, misses: Misses, fields: Sequence[Height
         face, other = misses.labels[row, column], misses.labels[row, following]
         ends = (other != face) & grid.hit[row, following]
         row, column, following, face, other = (of[ends] for of in (row, column, following, face, other))
-        own, next_one = misses.beyond[row, column], feet_at(grid, table, face, row, following).beyond
+        own, next_one = misses.beyond[row, column], met_at(grid, table, face, row, following).beyond
         gone = (own * next_one > 0.0) & (np.abs(next_one) > np.abs(own))
         meets = np.flatnonzero(gone & (other >= 0))
-        to_other = feet_at(grid, table, other[meets], row[meets], column[meets]).beyond
+        to_other = met_at(grid, table, other[meets], row[meets], column[meets]).beyond
         gone[meets] = np.abs(to_other) > OUTLIER * sigma
         labels[row[gone], column[gone]] = -1
     return labels
@@ -161,8 +176,8 @@ def adopt(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], sigma
         free = (labels < 0) & grid.hit
         face, row, column = _candidates(labels, free, tried)
         tried[face, row, column] = True
-        feet = feet_at(grid, table, face, row, column)
-        miss = np.where(np.abs(feet.slope) > STEEPEST, np.abs(feet.beyond), np.inf)
+        met = met_at(grid, table, face, row, column)
+        miss = np.where(np.abs(met.slope) > STEEPEST, np.abs(met.beyond), np.inf)
         order = np.lexsort((face, miss))
         order = order[miss[order] < ADOPTED * sigma][::-1]
         if not len(order):
@@ -255,7 +270,7 @@ def _move(grid: BeamGrid, labels: IntArray, table: Table, borders: _Borders, sig
     to_a, to_b = np.full((2, *window.shape), np.nan)
     k, i = np.nonzero(window & grid.hit[row[:, None], column])
     for way, face in ((to_a, a), (to_b, b)):
-        way[k, i] = feet_at(grid, table, face[k], row[k], column[k, i]).beyond
+        way[k, i] = met_at(grid, table, face[k], row[k], column[k, i]).beyond
     place = _best_breaks(to_a, to_b, np.full(len(row), REACH + 1), sigma)
     before = np.arange(at.shape[1]) < place[:, None]
     miss = np.where(before, to_a, to_b)

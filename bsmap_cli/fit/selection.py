@@ -9,7 +9,7 @@ import numpy as np
 
 from bsmap_cli.core.bspline import design_matrix
 from bsmap_cli.fit.blocks import Blocks
-from bsmap_cli.fit.feet import Feet, find_feet, tabulate
+from bsmap_cli.fit.feet import Met, meet, tabulate
 from bsmap_cli.fit.heights import (
     Base,
     HeightField,
@@ -53,7 +53,7 @@ class _Data(NamedTuple):
     bases : basis functions at the feet that were computed so far, by direction, degree and knots; along s times `root`.
     """
 
-    feet: Feet
+    feet: Met
     wanted: Array
     root: Array
     places: tuple[int, int]
@@ -125,7 +125,7 @@ def _linearise(field: HeightField, blocks: Blocks, sigma: float, near: _Data | N
     """Linear equations about a field's own feet; near: those of one near it."""
     only = np.zeros(len(blocks.counts), dtype=np.int64)
     start = None if near is None else near.feet.beyond
-    feet = find_feet(tabulate([field]), only, blocks.points, blocks.directions, start)
+    feet = meet(tabulate([field]), only, blocks.points, blocks.directions, start=start)
     wanted = feet.height - feet.slope * feet.beyond
     root = np.sqrt(blocks.counts) / sigma
     size = np.abs(feet.beyond) * root

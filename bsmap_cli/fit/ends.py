@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.crossings import EXACT, FARTHEST, SETTLED, Crossings
 from bsmap_cli.fit.feet import Feet, Table, offsets
-from bsmap_cli.fit.labels import runs_of
+from bsmap_cli.fit.labels import places_of_faces, runs_of
 from bsmap_cli.model import Array, IntArray
 
 BEYOND = 0.002
@@ -43,26 +43,30 @@ class Ends(NamedTuple):
 def find_ends(grid: BeamGrid, labels: IntArray, crossings: Crossings) -> Ends:
     """Ends of the runs of faces along the scans."""
     m, n = labels.shape
-    face, last, inner = np.full((3, 2, m, n), -1)
-    for row, start, stop in zip(*[a.tolist() for a in runs_of(labels)[:3]], strict=True):
-        hit = start + np.flatnonzero(grid.hit[row, start:stop])
-        if not len(hit):
-            continue
-        span = slice(start, stop)
-        last[:, row, span] = np.array([[hit[0]], [hit[-1]]])
-        inner[:, row, span] = hit[len(hit) // 2]
-        if start > 0 and crossings.along[row, start - 1] >= 0:
-            face[0, row, span] = labels[row, start - 1]
-        if stop < n and crossings.along[row, stop - 1] >= 0:
-            face[1, row, span] = labels[row, stop]
-    return Ends(face, last, inner)
+    row, start, stop, _ = runs_of(labels)
+    # Numbers of the returns of each run, those without any left out.
+    first, behind = (grid.before.number[row * n + end] for end in (start, stop))
+    row, start, stop, first, behind = (of[behind > first] for of in (row, start, stop, first, behind))
+    # A crossing on the edge before the run, or behind it.
+    into, out = np.full((2, len(row)), -1)
+    k = np.flatnonzero((start > 0) & (crossings.along[row, start - 1] >= 0))
+    into[k] = labels[row[k], start[k] - 1]
+    k = np.flatnonzero((stop < n) & (crossings.along[row, stop - 1] >= 0))
+    out[k] = labels[row[k], stop[k]]
+    place = grid.before.place % n
+    middle = place[first + (behind - first) // 2]
+    length = stop - start
+    at = np.arange(length.sum()) + np.repeat(row * n + start - np.cumsum(length) + length, length)
+    found = np.full((6, m * n), -1)
+    found[:, at] = np.repeat(np.stack([into, out, place[first], place[behind - 1], middle, middle]), length, axis=1)
+    return Ends(*found.reshape(3, 2, m, n))
 
 
 def on_faces(grid: BeamGrid, labels: IntArray, feet: Sequence[Feet]) -> BeamGrid:
     """The grid, its points moved along their beams to their feet on their faces: without the noise."""
     points = grid.points.copy()
-    for number, of_face in enumerate(feet):
-        points[(labels == number) & grid.hit] = of_face.points
+    for at, of_face in zip(places_of_faces(grid, labels, len(feet)), feet, strict=True):
+        points.reshape(-1, 3)[at] = of_face.points
     return replace(grid, points=points)
 
 
@@ -189,14 +193,12 @@ def _through(
     bad = np.zeros((m - 1, n), dtype=bool)
     own, other = slice(max(0, -step), n - max(0, step)), slice(max(0, step), n - max(0, -step))
     same = (labels[:-1, own] == labels[1:, other]) & (labels[:-1, own] >= 0)
-    row, column = np.nonzero(same & grid.hit[:-1, own] & grid.hit[1:, other])
-    column += own.start
+    same &= grid.hit[:-1, own] & grid.hit[1:, other]
     met = _corners(labels, crossings)
     for side in (0, 1):
-        faces = ends.face[side, row, column], ends.face[side, row + 1, column + step]
         # Two runs that end at the same face say nothing of what is between them, nor do two that end openly.
-        differ = faces[0] != faces[1]
-        r, c = row[differ], column[differ]
+        r, c = np.nonzero(same & (ends.face[side, :-1, own] != ends.face[side, 1:, other]))
+        c += own.start
         first, second = (_End(grid, table, ends, side, r + k, c + k * step) for k in (0, 1))
         here, there = grid.points[r, c], grid.points[r + 1, c + step]
         a0, a1, b0, b1 = first.beyond(here), first.beyond(there), second.beyond(here), second.beyond(there)

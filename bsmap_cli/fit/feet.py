@@ -175,6 +175,15 @@ def offsets(table: Table, face: IntArray, points: Array) -> tuple[Array, Array]:
     return (local[2] - height) / length, (normal / length).T
 
 
+def parameters_at(table: Table, face: IntArray, points: Array) -> Array:
+    """(n, 2) parameters of points (n, 3) on their faces (n,)."""
+    frame = table.frame.take(face, axis=1)
+    local = _turned(frame, points.T - frame[9:])
+    at = _round_ones(table, face, len(points))[0]
+    local[:, at] = _around(table, face[at], local[:, at])[0]
+    return ((local[:2] - table.low.take(face, axis=1)) / table.size.take(face, axis=1)).T
+
+
 def _newton(table: Table, face: IntArray, p: Array, d: Array, start: Array, steps: int) -> tuple[Array, Array]:
     """(2, n) parameters; (3, n) way beyond the points, slope and height, of beams p, d (3, n)."""
     # Over a plane s, t and h change evenly along a beam.

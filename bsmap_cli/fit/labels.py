@@ -61,14 +61,25 @@ def feet_of(grid: BeamGrid, field: HeightField, mask: NDArray[np.bool_]) -> Feet
     return find_feet(tabulate([field]), np.zeros(mask.sum(), dtype=np.int64), grid.points[mask], grid.directions[mask])
 
 
+def places_of_faces(grid: BeamGrid, labels: IntArray, faces: int) -> list[IntArray]:
+    """Flat indices of the beams of each of so many faces that have a return, in the order of the grid."""
+    at = np.flatnonzero((labels >= 0) & grid.hit)
+    face = labels.ravel()[at]
+    at = at[np.argsort(face.astype(np.int16 if faces < 2**15 else np.int64), kind="stable")]
+    ends = np.cumsum(np.bincount(face, minlength=faces)).tolist()
+    return [at[a:b] for a, b in itertools.pairwise([0, *ends])]
+
+
 def feet_of_faces(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField]) -> list[Feet]:
     """Feet of the beams of each face that have a return, in the order of the grid."""
-    at = np.flatnonzero((labels >= 0) & grid.hit)
-    at = at[np.argsort(labels.ravel()[at], kind="stable")]
-    face = labels.ravel()[at]
-    feet = find_feet(tabulate(fields), face, grid.points.reshape(-1, 3)[at], grid.directions.reshape(-1, 3)[at])
-    bounds = np.searchsorted(face, np.arange(len(fields) + 1))
-    return [Feet(*(of[a:b] for of in feet)) for a, b in itertools.pairwise(bounds.tolist())]
+    places = places_of_faces(grid, labels, len(fields))
+    at = np.concatenate([np.zeros(0, dtype=np.int64), *places])
+    points, directions = (of.reshape(-1, 3)[at] for of in (grid.points, grid.directions))
+    feet = find_feet(
+        tabulate(fields), np.repeat(np.arange(len(fields)), [len(of) for of in places]), points, directions
+    )
+    ends = np.cumsum([0, *(len(of) for of in places)]).tolist()
+    return [Feet(*(of[a:b] for of in feet)) for a, b in itertools.pairwise(ends)]
 
 
 class Misses(NamedTuple):

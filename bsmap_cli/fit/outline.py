@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bsmap_cli.core.polygons import signed_area
 from bsmap_cli.fit.crossings import Crossings
 from bsmap_cli.model import Array, IntArray
 
@@ -19,38 +18,61 @@ SIDES = (((0, 0), "along"), ((0, 1), "across"), ((1, 0), "along"), ((0, 0), "acr
 CORNERS = ((0, 0), (0, 1), (1, 1), (1, 0))
 
 
-class Loops(NamedTuple):
-    """Closed loops of a face, each a list of vertices: beams (row * n + column), or m * n + number of a crossing."""
+class Nodes(NamedTuple):
+    """Parameters on their faces of what outlines run through.
 
-    vertices: list[list[int]]
+    beams : (m, n, 2) of beams.  crossings : (k, 2, 2) of crossings, on both of their faces (k, 2).
+    """
+
+    beams: Array
+    crossings: Array
+    faces: IntArray
+
+    def at(self, face: int, vertices: IntArray) -> Array:
+        """(j, 2) on a face, of vertices (j,): beams (row * n + column), or m * n + number of a crossing."""
+        first = self.beams.shape[0] * self.beams.shape[1]
+        out = np.empty((len(vertices), 2))
+        crossing = vertices >= first
+        number = vertices[crossing] - first
+        out[~crossing] = self.beams.reshape(-1, 2)[vertices[~crossing]]
+        out[crossing] = self.crossings[number, (self.faces[number, 1] == face).astype(np.int64)]
+        return out
 
 
-def outline(
-    face: int, labels: IntArray, crossings: Crossings, uv: Array, crossing_uv: Array, believed: NDArray[np.bool_]
-) -> Loops:
-    """Loops around the cells of a face, counter-clockwise in its parameters, holes clockwise.
+def outlines(
+    faces: int, labels: IntArray, crossings: Crossings, nodes: Nodes, believed: NDArray[np.bool_]
+) -> list[list[list[int]]]:
+    """Loops around the cells of each of so many faces, counter-clockwise in its parameters, holes clockwise.
 
     Where the cells lie mirrored in the parameters (beyond the pole of a rotation), they get loops of their own, so
     that every cell is run around counter-clockwise: a point is on the face if the loops wind around it.
 
-    uv : (m, n, 2) parameters of the face's beams.  crossing_uv : (k, 2) of all crossings on this face.
     believed : (4, m - 1, n - 1) corners of cells that count, in the order of CORNERS.
     """
-    member = labels == face
-    corners = np.stack([member[:-1, :-1], member[:-1, 1:], member[1:, 1:], member[1:, :-1]]) & believed
-    full = np.all(corners, axis=0)
-    row, column = np.nonzero(np.any(corners, axis=0) & ~full)
-    mirrored = np.zeros_like(full)
-    cells = np.nonzero(full)
-    mirrored[cells] = signed_area(np.stack([uv[cells[0] + i, cells[1] + k] for i, k in CORNERS], axis=1)) < 0.0
-    shares = _shares(crossings, corners[:, row, column].T, row, column, face)
-    at = np.concatenate([uv.reshape(-1, 2), crossing_uv])[shares.vertices]
-    backwards = _areas(shares, at) < 0.0
-    loops: list[list[int]] = []
-    for turned in (False, True):
-        edges = np.concatenate([_border(full & (mirrored == turned)), _edges(shares, backwards == turned)])
-        loops += [loop[::-1] if turned else loop for loop in chain(_left_over(edges))]
-    return Loops(loops)
+    corners = np.stack([labels[:-1, :-1], labels[:-1, 1:], labels[1:, 1:], labels[1:, :-1]])
+    corners[~believed] = -1
+    same = (corners[0] == corners[1]) & (corners[0] == corners[2]) & (corners[0] == corners[3])
+    group = np.where(same & (corners[0] >= 0), 2 * corners[0] + _mirrored(nodes.beams), -1)
+    row, column = np.nonzero(~same)
+    corners = corners[:, row, column].T
+    sides, of_side = _borders(group)
+    loops: list[list[list[int]]] = []
+    for face in range(faces):
+        own = corners == face
+        shared = np.flatnonzero(own.any(axis=1))
+        shares = _shares(crossings, own[shared], row[shared], column[shared], face)
+        backwards = _areas(shares, nodes.at(face, shares.vertices)) < 0.0
+        loops.append([])
+        for turned in (False, True):
+            edges = np.concatenate([sides[of_side == 2 * face + turned], _edges(shares, backwards == turned)])
+            loops[-1] += [loop[::-1] if turned else loop for loop in chain(_left_over(edges))]
+    return loops
+
+
+def _mirrored(uv: Array) -> NDArray[np.bool_]:
+    """(m - 1, n - 1) cells that are run around clockwise at parameters (m, n, 2)."""
+    down, up = uv[1:, 1:] - uv[:-1, :-1], uv[1:, :-1] - uv[:-1, 1:]
+    return np.asarray(down[..., 0] * up[..., 1] < down[..., 1] * up[..., 0])
 
 
 class _Shares(NamedTuple):
@@ -105,17 +127,20 @@ def _edges(shares: _Shares, keep: NDArray[np.bool_]) -> IntArray:
     return np.column_stack([shares.vertices, shares.following])[keep[shares.of]]
 
 
-def _border(full: NDArray[np.bool_]) -> IntArray:
-    """(k, 2) those directed sides of whole cells that no other whole cell shares."""
-    n = full.shape[1] + 1
-    padded = np.pad(full, 1)
+def _borders(group: IntArray) -> tuple[IntArray, IntArray]:
+    """(k, 2) those directed sides of cells in groups (m - 1, n - 1) that no cell of the same group shares; and their
+    groups (k,).
+    """
+    n = group.shape[1] + 1
+    padded = np.pad(group, 1, constant_values=-1)
     shifts = (padded[:-2, 1:-1], padded[1:-1, 2:], padded[2:, 1:-1], padded[1:-1, :-2])
-    out = []
+    out, of = [], []
     for side, neighbour in enumerate(shifts):
-        row, column = np.nonzero(full & ~neighbour)
+        row, column = np.nonzero((group >= 0) & (group != neighbour))
         ends = [(row + i) * n + column + k for i, k in (CORNERS[side], CORNERS[(side + 1) % 4])]
         out.append(np.column_stack(ends))
-    return np.concatenate(out)
+        of.append(group[row, column])
+    return np.concatenate(out), np.concatenate(of)
 
 
 def _left_over(edges: IntArray) -> IntArray:

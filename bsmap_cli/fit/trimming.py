@@ -12,10 +12,10 @@ from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.crossings import Crossings, find_crossings
 from bsmap_cli.fit.division import Faces
 from bsmap_cli.fit.ends import doubtful_cells, find_ends, on_faces, passed_through, within_ends
-from bsmap_cli.fit.feet import Feet, tabulate
+from bsmap_cli.fit.feet import Feet, Table, parameters_at, tabulate
 from bsmap_cli.fit.heights import HeightField
-from bsmap_cli.fit.labels import feet_of
-from bsmap_cli.fit.outline import outline
+from bsmap_cli.fit.labels import met_at, places_of_faces
+from bsmap_cli.fit.outline import Nodes, outlines
 from bsmap_cli.model import Array, IntArray, TrimLoop
 
 BORDER_TOLERANCE, CREASE_TOLERANCE = 0.004, 0.001
@@ -48,123 +48,124 @@ def trim(grid: BeamGrid, faces: Faces, feet: Sequence[Feet]) -> Trims:
     crossings = within_ends(clean, faces.labels, table, crossings, ends)
     crossings = passed_through(clean, faces.labels, table, crossings, ends)
     believed = ~(doubtful | beyond_bare_ends(clean, faces.labels, fields, ends))
-    creases: dict[tuple[int, ...], int] = {}
-    lines: list[CreaseLine] = []
+    nodes = _nodes(grid, faces.labels, table, fields, feet, crossings)
+    pairs = crossings.faces.min(axis=1) * len(fields) + crossings.faces.max(axis=1)
+    pairs[crossings.passed.any(axis=1)] = -1
+    sides = _Sides(nodes, pairs, crossings.points, {}, [])
     loops = []
-    for number, field in enumerate(fields):
-        uv = _node_parameters(grid, faces.labels, number, field, feet[number])
-        at_crossings = field.parameters(field.base.local(crossings.points))
-        found = outline(number, faces.labels, crossings, uv, at_crossings, believed)
-        sides = _Sides(field, uv.reshape(-1, 2), at_crossings, crossings, creases, lines)
-        loops.append([loop for vertices in found.vertices if (loop := _loop(sides, vertices)) is not None])
-    return Trims(loops, lines)
+    for number, around in enumerate(outlines(len(fields), faces.labels, crossings, nodes, believed)):
+        size = fields[number].high - fields[number].low
+        made = (_loop(sides, number, size, np.array(vertices)) for vertices in around)
+        loops.append([loop for loop in made if loop is not None])
+    return Trims(loops, sides.lines)
 
 
-def _node_parameters(grid: BeamGrid, labels: IntArray, number: int, field: HeightField, feet: Feet) -> Array:
-    """(m, n, 2) parameters of a face's beams; of beams without return between them, by their neighbours."""
-    member = labels == number
-    uv = np.full((*labels.shape, 2), np.nan)
-    seen = member & grid.hit
-    short = _stands_on(grid, labels, number, field)[seen] & (feet.beyond > 0.0)
-    uv[seen] = np.where(short[:, None], field.parameters(field.base.local(grid.points[seen])), feet.uv)
-    for row in np.flatnonzero((member & ~grid.hit).any(axis=1)):
-        at, known = np.flatnonzero(member[row] & ~grid.hit[row]), np.flatnonzero(seen[row])
-        for axis in (0, 1):
-            uv[row, at, axis] = np.interp(at, known, uv[row, known, axis])
-    return uv
+def _nodes(
+    grid: BeamGrid,
+    labels: IntArray,
+    table: Table,
+    fields: Sequence[HeightField],
+    feet: Sequence[Feet],
+    crossings: Crossings,
+) -> Nodes:
+    """Parameters of beams and crossings; of beams without return between others of their face, by these."""
+    m, n = labels.shape
+    uv, beyond = np.full((m * n, 2), np.nan), np.zeros(m * n)
+    for at, of_face in zip(places_of_faces(grid, labels, len(fields)), feet, strict=True):
+        uv[at], beyond[at] = of_face.uv, of_face.beyond
+    short = np.flatnonzero(_stand_on(grid, labels, table).ravel() & (beyond > 0.0))
+    uv[short] = parameters_at(table, labels.ravel()[short], grid.points.reshape(-1, 3)[short])
+    missing = np.flatnonzero((labels >= 0) & ~grid.hit)
+    before, behind = (grid.before.place[grid.before.number[missing] - k] for k in (1, 0))
+    share = ((missing - before) / (behind - before))[:, None]
+    uv[missing] = (1.0 - share) * uv[before] + share * uv[behind]
+    pair = crossings.faces.ravel()
+    at_crossings = parameters_at(table, pair, np.repeat(crossings.points, 2, axis=0))
+    return Nodes(uv.reshape(m, n, 2), at_crossings.reshape(-1, 2, 2), crossings.faces)
 
 
-def _stands_on(grid: BeamGrid, labels: IntArray, number: int, field: HeightField) -> NDArray[np.bool_]:
-    """(m, n) beams of a face whose neighbour in the scan hits something in front of it.
+def _stand_on(grid: BeamGrid, labels: IntArray, table: Table) -> NDArray[np.bool_]:
+    """(m, n) beams whose neighbour in the scan hits something in front of their face.
 
     What stands on the face may begin at the beam itself: a foot behind the measured point is no part of the face.
     """
-    member = labels == number
-    out = np.zeros_like(member)
-    for own, next_one in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:, 1:], np.s_[:, :-1])):
-        last = np.zeros_like(member)
-        last[next_one] = member[own] & ~member[next_one]
-        last &= grid.hit
-        in_front = np.zeros_like(member)
-        in_front[last] = feet_of(grid, field, last).beyond > 0.0
-        out[own] |= member[own] & in_front[next_one]
+    out = np.zeros(labels.shape, dtype=bool)
+    last = labels[:, :-1] != labels[:, 1:]
+    for own, following in ((0, 1), (1, 0)):
+        face, hit = (of[:, k : k + last.shape[1]] for of, k in ((labels, own), (grid.hit, following)))
+        row, column = np.nonzero(last & (face >= 0) & hit)
+        met = met_at(grid, table, labels[row, column + own], row, column + following)
+        out[row, column + own] |= met.beyond > 0.0
     return out
 
 
 class _Sides(NamedTuple):
-    """What turning a loop of numbers into a polygon needs; `creases` and `lines` grow."""
+    """What turning loops of numbers into polygons needs; `creases` and `lines` grow.
 
-    field: HeightField
-    uv: Array
-    at_crossings: Array
-    crossings: Crossings
+    pairs : (k,) of each crossing the two faces, as one number; -1 where one of them ends before.  points : (k, 3).
+    """
+
+    nodes: Nodes
+    pairs: IntArray
+    points: Array
     creases: dict[tuple[int, ...], int]
     lines: list[CreaseLine]
 
-    def parameters(self, vertices: list[int]) -> Array:
-        """(k, 2) of beams and crossings."""
-        first = len(self.uv)
-        return np.array([self.at_crossings[v - first] if v >= first else self.uv[v] for v in vertices])
+    @property
+    def first(self) -> int:
+        """Number of the first crossing among vertices."""
+        return self.nodes.beams.shape[0] * self.nodes.beams.shape[1]
 
-    def pair(self, vertex: int) -> tuple[int, int] | None:
-        """The two faces of a crossing that both reach; None for a beam, or where one ends before."""
-        if vertex < len(self.uv) or self.crossings.passed[vertex - len(self.uv)].any():
-            return None
-        a, b = self.crossings.faces[vertex - len(self.uv)].tolist()
-        return (a, b) if a < b else (b, a)
+    def pairs_of(self, vertices: IntArray) -> IntArray:
+        """(j,) pairs of faces of vertices (j,); -1 for beams."""
+        out = np.full(len(vertices), -1)
+        crossing = vertices >= self.first
+        out[crossing] = self.pairs[vertices[crossing] - self.first]
+        return out
 
 
-def _loop(sides: _Sides, vertices: list[int]) -> TrimLoop | None:
-    """Loop with simplified sides; None where little is left."""
-    size = sides.field.high - sides.field.low
-    if abs(signed_area(sides.parameters(vertices) * size)) < LEAST_AREA:
+def _loop(sides: _Sides, face: int, size: Array, vertices: IntArray) -> TrimLoop | None:
+    """Loop with simplified sides; None where little is left.  size : (2,) metres of the face's rectangle."""
+    if abs(signed_area(sides.nodes.at(face, vertices) * size)) < LEAST_AREA:
         return None
     kept: list[int] = []
     marks: list[int] = []
     for run, pair in _runs(sides, vertices):
-        if pair is not None and len(run) > 1:
-            number, line = _crease(sides, run, pair)
+        if pair >= 0 and len(run) > 1:
+            number, line = _crease(sides, run)
         else:
-            metres = sides.parameters(run) * size
-            number, line = -1, [v for v, keep in zip(run, simplify(metres, BORDER_TOLERANCE), strict=True) if keep]
-        kept += line
+            number, line = -1, run[simplify(sides.nodes.at(face, run) * size, BORDER_TOLERANCE)]
+        kept += line.tolist()
         marks += [number] * (len(line) - 1) + [-1]
     if len(kept) < 3:
         return None
-    return TrimLoop(np.clip(sides.parameters(kept), 0.0, 1.0), np.array(marks))
+    return TrimLoop(np.clip(sides.nodes.at(face, np.array(kept)), 0.0, 1.0), np.array(marks))
 
 
-def _runs(sides: _Sides, vertices: list[int]) -> list[tuple[list[int], tuple[int, int] | None]]:
+def _runs(sides: _Sides, vertices: IntArray) -> list[tuple[IntArray, int]]:
     """Stretches of a loop along one crease or one open border; a loop of one kind begins at its lowest number."""
-    pairs = [sides.pair(v) for v in vertices]
-    changes = [k for k in range(len(vertices)) if pairs[k] != pairs[k - 1]]
-    start = changes[0] if changes else vertices.index(min(vertices))
-    vertices, pairs = vertices[start:] + vertices[:start], pairs[start:] + pairs[:start]
-    if not changes:
-        half = len(vertices) // 2
-        closed = [*vertices[half:], vertices[0]]
-        return [(vertices[: half + 1], pairs[0]), (closed, pairs[0])] if pairs[0] is not None else _open(vertices)
-    out: list[tuple[list[int], tuple[int, int] | None]] = []
-    for vertex, pair in zip(vertices, pairs, strict=True):
-        if out and out[-1][1] == pair:
-            out[-1][0].append(vertex)
-        else:
-            out.append(([vertex], pair))
-    return out
+    pairs = sides.pairs_of(vertices)
+    changes = np.flatnonzero(pairs != np.roll(pairs, 1))
+    start = int(changes[0] if len(changes) else np.argmin(vertices))
+    vertices, pairs = np.roll(vertices, -start), np.roll(pairs, -start)
+    if not len(changes):
+        half, pair = len(vertices) // 2, int(pairs[0])
+        if pair < 0:
+            return [(vertices[:half], -1), (vertices[half:], -1)]
+        return [(vertices[: half + 1], pair), (np.append(vertices[half:], vertices[0]), pair)]
+    cuts = np.flatnonzero(np.diff(pairs)) + 1
+    return list(zip(np.split(vertices, cuts), pairs[[0, *cuts]].tolist(), strict=True))
 
 
-def _open(vertices: list[int]) -> list[tuple[list[int], tuple[int, int] | None]]:
-    half = len(vertices) // 2
-    return [(vertices[:half], None), (vertices[half:], None)]
-
-
-def _crease(sides: _Sides, run: list[int], pair: tuple[int, int]) -> tuple[int, list[int]]:
+def _crease(sides: _Sides, run: IntArray) -> tuple[int, IntArray]:
     """Number of the crease along a run of crossings, and those of its vertices that stay; the same from both faces."""
     turned = run[0] > run[-1]
-    key = tuple(run[::-1] if turned else run)
-    points = sides.crossings.points[np.array(key) - len(sides.uv)]
-    kept = [v for v, keep in zip(key, simplify(points, CREASE_TOLERANCE), strict=True) if keep]
+    line = run[::-1] if turned else run
+    key = tuple(line.tolist())
+    points = sides.points[line - sides.first]
+    keep = simplify(points, CREASE_TOLERANCE)
     if key not in sides.creases:
+        a, b = np.sort(sides.nodes.faces[line[0] - sides.first]).tolist()
         sides.creases[key] = len(sides.lines)
-        sides.lines.append(CreaseLine(pair, sides.crossings.points[np.array(kept) - len(sides.uv)]))
-    return sides.creases[key], kept[::-1] if turned else kept
+        sides.lines.append(CreaseLine((a, b), points[keep]))
+    return sides.creases[key], line[keep][::-1] if turned else line[keep]

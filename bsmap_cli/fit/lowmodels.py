@@ -25,6 +25,8 @@ BASINS, TILTS = 3, 8
 """Of them, how many are followed, and for how many steps."""
 UPRIGHT = 1e-4
 """Radians by which an axis that is right may still lean."""
+GAINS = 0.05, 1e-3
+"""Shares of the misfit that a step must gain to be followed by another: while axes are looked for, and of the best."""
 ENOUGH_BLOCKS = 300, 1500
 """Evenly taken, to tell directions apart and for the best of them: heights over the base make up for what the axis
 misses."""
@@ -163,7 +165,7 @@ def axes_of(normal: Array) -> Array:
 
 def fit_cylinder_frame(blocks: Blocks) -> CylinderFrame | None:
     """Vertical cylinder through blocks; None where they lie on no circle."""
-    circle = _circles(blocks.points.T[None, :2], blocks.directions.T[None, :2], blocks.counts)
+    circle = _circles(blocks.points.T[None, :2], blocks.directions.T[None, :2], blocks.counts, 4)
     return CylinderFrame(circle.centre[0], float(circle.radius[0])) if circle.good[0] else None
 
 
@@ -175,8 +177,11 @@ class _Circles(NamedTuple):
     good: NDArray[np.bool_]
 
 
-def _circles(points: Array, directions: Array, counts: Array) -> _Circles:
-    """Circles through points (k, 2, n) in k planes by least squares along the beams (k, 2, n); weights (n,)."""
+def _circles(points: Array, directions: Array, counts: Array, steps: int) -> _Circles:
+    """Circles through points (k, 2, n) in k planes by least squares along the beams (k, 2, n); weights (n,).
+
+    steps : the first regards all beams as steep, the others know their incidence by the circle before.
+    """
     middle = points @ counts / counts.sum()
     rows = np.ones((len(points), 4, points.shape[2]))
     np.subtract(points, middle[:, :, None], out=rows[:, :2])
@@ -185,7 +190,7 @@ def _circles(points: Array, directions: Array, counts: Array) -> _Circles:
     reach = np.sum(rows[:, :2] * directions, axis=1)
     weight = np.broadcast_to(counts, reach.shape)
     centre, radius, good = np.zeros((len(points), 2)), np.zeros(len(points)), np.ones(len(points), dtype=bool)
-    for step in range(4):
+    for step in range(steps):
         if step:
             towards = np.sum(centre[:, :, None] * directions, axis=1)
             weight = counts / np.maximum(np.abs(reach - towards), 2.0 * GRAZING * radius[:, None]) ** 2
@@ -210,19 +215,22 @@ def fit_axis(blocks: Blocks) -> Array | None:
     few, blocks = (blocks.pick(np.arange(0, len(blocks.counts), -(-len(blocks.counts) // n))) for n in ENOUGH_BLOCKS)
     frames = np.array([axes_of(axis) for axis in AXES])
     order = np.argsort(_lean(few, frames).misfit, kind="stable")[:BASINS]
-    axes, misfit = _followed(few, frames[order])
-    axes, misfit = _followed(blocks, axes[[int(np.argmin(misfit))]])
+    axes, misfit = _followed(few, frames[order], GAINS[0])
+    axes, misfit = _followed(blocks, axes[[int(np.argmin(misfit))]], GAINS[1])
     return axes[0] if np.isfinite(misfit[0]) else None
 
 
-def _followed(blocks: Blocks, axes: Array) -> tuple[Array, Array]:
-    """The best of the frames (k, 3, 3) to which Gauss and Newton lead from each of `axes`, and its misfit (k,)."""
+def _followed(blocks: Blocks, axes: Array, gain: float) -> tuple[Array, Array]:
+    """The best of the frames (k, 3, 3) to which Gauss and Newton lead from each of `axes`, and its misfit (k,).
+
+    gain : share of the misfit that a step must gain to be followed by another.
+    """
     best, least = axes, np.full(len(axes), np.inf)
     for _ in range(TILTS):
         found = _lean(blocks, axes)
-        better = found.misfit < least
+        better, gained = found.misfit < least, found.misfit < (1.0 - gain) * least
         best, least = np.where(better[:, None, None], axes, best), np.where(better, found.misfit, least)
-        going = np.isfinite(found.misfit) & (np.abs(found.tilt).max(axis=1) > UPRIGHT)
+        going = gained & (np.abs(found.tilt).max(axis=1) > UPRIGHT)
         if not going.any():
             break
         axes = np.array(
@@ -242,7 +250,7 @@ def _lean(blocks: Blocks, axes: Array) -> _Lean:
     """The same of axes (k, 3, 3)."""
     turns = np.swapaxes(axes, 1, 2)
     points, across = turns @ blocks.points.T, turns[:, :2] @ blocks.directions.T
-    circle = _circles(points[:, :2], across, blocks.counts)
+    circle = _circles(points[:, :2], across, blocks.counts, 2)
     xy = points[:, :2] - circle.centre[:, :, None]
     distance = np.sqrt(np.sum(xy * xy, axis=1))
     n = xy / np.maximum(distance, 1e-9)[:, None]

@@ -79,26 +79,31 @@ def _unit(vectors: Array) -> Array:
     return vectors / np.sqrt(np.sum(vectors**2, axis=1, keepdims=True))
 
 
-def thinned(blocks: Blocks) -> Blocks:
-    """Blocks of one face, those of neighbouring scans taken together as long as these lie within NARROW.
+def thinned(blocks: Blocks, beams: int = LARGEST, narrow: float = NARROW) -> Blocks:
+    """Blocks of one face of up to so many beams, those of scans that lie within `narrow` metres taken together.
 
     Over so short a way even a pillar is flat to less than what the noise leaves of a mean. Scans farther apart stay.
     """
-    cell = (blocks.column / LARGEST).astype(np.int64)
-    order = np.lexsort((blocks.row, cell))
-    successive = (np.diff(cell[order]) == 0) & (np.diff(blocks.row[order]) == 1)
-    if not successive.any():
+    if len(blocks.row) < 2:
         return blocks
-    steps = np.linalg.norm(np.diff(blocks.points[order], axis=0)[successive], axis=1)
-    scans = int(min(NARROW / np.quantile(steps, 0.95), np.ptp(blocks.row) / FEWEST_ROWS)) + 1
+    row, cell = blocks.row - blocks.row.min(), (blocks.column / beams).astype(np.int64)
+    cell -= cell.min()
+    cells = int(cell.max()) + 1
+    at = np.full((int(row.max()) + 1, cells), -1)
+    at[row, cell] = np.arange(len(row))
+    before, behind = at[:-1][both := (at[:-1] >= 0) & (at[1:] >= 0)], at[1:][both]
+    if not len(before):
+        return blocks
+    steps = np.sqrt(np.sum((blocks.points[behind] - blocks.points[before]) ** 2, axis=1))
+    scans = int(min(narrow / np.quantile(steps, 0.95), np.ptp(row) / FEWEST_ROWS)) + 1
     if scans < 2:
         return blocks
-    group = blocks.row // scans
-    order = np.lexsort((cell, group))
-    first = np.flatnonzero((np.diff(cell[order], prepend=-1) != 0) | (np.diff(group[order], prepend=-1) != 0))
-    weight = blocks.counts[order]
-    counts = np.add.reduceat(weight, first)
-    values = np.column_stack([blocks.points, blocks.directions, blocks.column])[order]
-    mean = np.add.reduceat(values * weight[:, None], first) / counts[:, None]
-    head = order[first]
+    key = (blocks.row // scans - blocks.row.min() // scans) * cells + cell
+    counts = np.bincount(key, blocks.counts).astype(np.float64)
+    kept = np.flatnonzero(counts)
+    head = np.empty(len(counts), dtype=np.int64)
+    head[key[::-1]] = np.arange(len(key))[::-1]
+    head, counts = head[kept], counts[kept]
+    values = (*blocks.points.T, *blocks.directions.T, blocks.column)
+    mean = np.stack([np.bincount(key, of * blocks.counts)[kept] / counts for of in values], axis=1)
     return Blocks(mean[:, :3], _unit(mean[:, 3:6]), counts, blocks.row[head], mean[:, 6], blocks.owner[head])

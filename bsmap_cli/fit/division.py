@@ -41,8 +41,12 @@ BELIEVED = 0.9
 """Share of its beams that a face must fit."""
 LITTLE = 0.05
 """Share of its beams in which a face has hardly changed."""
+CLOSE = 0.01
+"""Metres from the first to the last scan of single beams taken together."""
 MOST_ROWS = 10_000_000
 """Elements of a design matrix up to which a face is fitted to single beams."""
+ENOUGH_STEPS = 10_000
+"""Between neighbouring beams of a face, to tell how wide they usually are."""
 ROUNDS = 2
 """Of dividing the beams anew by the fitted surfaces."""
 
@@ -101,10 +105,12 @@ def _widened(grid: BeamGrid, labels: IntArray, fitted: list[Fitted], sigma: floa
     """
     crossings = find_crossings(grid, labels, [f.field for f in fitted])
     out = []
-    pairs = zip(blocks_of_faces(grid, labels), _beams_of_faces(grid, labels), strict=True)
+    bent = np.array([f.field.knots.size > 4 for f in fitted], dtype=bool)
+    of_bent = _beams_of_faces(grid, np.where((labels >= 0) & bent[labels], labels, -1), len(fitted))
+    pairs = zip(blocks_of_faces(grid, labels), of_bent, strict=True)
     for number, (old, (blocks, beams)) in enumerate(zip(fitted, pairs, strict=True)):
         field = old.field
-        curved = field.knots.size > 4 and len(beams.counts) * field.knots.size < MOST_ROWS
+        curved = bent[number] and len(beams.counts) * field.knots.size < MOST_ROWS
         at = field.base.local(crossings.points[np.any(crossings.faces == number, axis=1)])[:, :2]
         low = np.maximum(np.vstack([at, field.low]).min(axis=0), field.low - FARTHEST)
         high = np.minimum(np.vstack([at, field.high]).max(axis=0), field.high + FARTHEST)
@@ -149,20 +155,22 @@ def _kept(labels: IntArray, grid: BeamGrid) -> tuple[IntArray, IntArray]:
 def blocks_of_faces(grid: BeamGrid, labels: IntArray) -> list[Blocks]:
     """Blocks of each face."""
     runs = runs_of(labels)
-    return [thinned(one) for one in _by_face(make_blocks(grid, runs.row, runs.start, runs.stop), runs)]
+    blocks = make_blocks(grid, runs.row, runs.start, runs.stop)
+    return [thinned(one) for one in _by_face(blocks, runs, int(labels.max(initial=-1)) + 1)]
 
 
-def _beams_of_faces(grid: BeamGrid, labels: IntArray) -> list[Blocks]:
-    """Beams of each face; single ones stay single where scans are close, too."""
+def _beams_of_faces(grid: BeamGrid, labels: IntArray, faces: int) -> list[Blocks]:
+    """Beams of each of so many faces; only those of scans that lie very close are taken together."""
     runs = runs_of(labels)
-    return _by_face(single_beams(grid, runs.row, runs.start, runs.stop), runs)
+    beams = single_beams(grid, runs.row, runs.start, runs.stop)
+    return [thinned(one, 1, CLOSE) for one in _by_face(beams, runs, faces)]
 
 
-def _by_face(blocks: Blocks, runs: Runs) -> list[Blocks]:
+def _by_face(blocks: Blocks, runs: Runs, faces: int) -> list[Blocks]:
     """The blocks of runs, face by face."""
     face = runs.label[blocks.owner]
-    blocks = blocks.pick(np.argsort(face, kind="stable"))
-    ends = np.cumsum(np.bincount(face, minlength=int(runs.label.max(initial=-1)) + 1)).tolist()
+    blocks = blocks.pick(np.argsort(face.astype(np.int16 if faces < 2**15 else np.int64), kind="stable"))
+    ends = np.cumsum(np.bincount(face, minlength=faces)).tolist()
     return [blocks.pick(slice(a, b)) for a, b in itertools.pairwise([0, *ends])]
 
 
@@ -231,8 +239,9 @@ def _rectangle(grid: BeamGrid, member: NDArray[np.bool_], base: Base) -> tuple[A
     st = np.full((int(np.ptp(row)) + 1, int(np.ptp(column)) + 1, 2), np.nan)
     st[row - row.min(), column - column.min()] = at
     margin = np.full(2, 0.02)
-    for axis in (0, 1):
-        steps = np.abs(np.diff(st, axis=axis)).reshape(-1, 2)
+    every = 1 + len(row) // ENOUGH_STEPS
+    for axis, some in ((0, st[:, ::every]), (1, st[::every])):
+        steps = np.abs(np.diff(some, axis=axis)).reshape(-1, 2)
         steps = steps[np.isfinite(steps[:, 0])]
         if len(steps):
             usual = int(0.95 * (len(steps) - 1))

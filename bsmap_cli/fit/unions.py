@@ -10,6 +10,7 @@ from bsmap_cli.fit.context import PRICE, Context
 from bsmap_cli.fit.lowmodels import (
     ORDERS,
     PlaneFrame,
+    Sums,
     chi_squares,
     fit_axis,
     fit_cylinder_frame,
@@ -21,14 +22,19 @@ from bsmap_cli.model import Array
 
 NEAR = 1.5
 """Metres between the boxes of two regions that may be one face."""
+FAR = 2.0
+"""Times the criterion of two regions apart, beyond which that of both as one need not be known exactly."""
 VAULT = 200
 """Blocks of a surface that may be a cylinder with any axis: clutter lies on many, and to look for them takes time."""
 
 
 class _Region(NamedTuple):
+    """Pieces as one surface; sums : of its blocks, over its frame."""
+
     members: tuple[int, ...]
     blocks: Blocks
     frame: PlaneFrame
+    sums: Sums
     cost: float
     box: Array
     round: bool
@@ -60,8 +66,9 @@ def _region(context: Context, members: Sequence[int]) -> _Region:
     blocks = thinned(context.blocks_of(members))
     frame = fit_plane_frame(blocks)
     box = np.array([blocks.points.min(axis=0), blocks.points.max(axis=0)])
-    low = low_order_cost(blocks, frame, context.sigma)
-    return _Region(tuple(members), blocks, frame, low.cost, box, low.is_round, low.bent)
+    sums = sums_of(frame, blocks, context.sigma)
+    low = _low_order_cost(blocks, sums, context.sigma)
+    return _Region(tuple(members), blocks, frame, sums, low.cost, box, low.is_round, low.bent)
 
 
 class LowOrder(NamedTuple):
@@ -81,10 +88,11 @@ def low_order_cost(blocks: Blocks, frame: PlaneFrame, sigma: float) -> LowOrder:
 
     A cylinder with any axis is tried where all these are: what is nearly flat lies on many cylinders.
     """
-    sums = sums_of(frame, blocks, sigma)
-    rows = len(np.unique(blocks.row))
-    sizes = tuple(size for size, least in zip(ORDERS, (1, 5, 8, 12), strict=True) if rows >= least)
-    costs = chi_squares(sums, sizes) + PRICE * np.array(sizes)
+    return _low_order_cost(blocks, sums_of(frame, blocks, sigma), sigma)
+
+
+def _low_order_cost(blocks: Blocks, sums: Sums, sigma: float) -> LowOrder:
+    costs = _costs(sums, len(np.unique(blocks.row)))
     best = int(np.argmin(costs))
     poor = 2.0 * len(blocks.counts) + 50.0
     found = LowOrder(float(costs[best]), False, best > 0)
@@ -98,6 +106,12 @@ def low_order_cost(blocks: Blocks, frame: PlaneFrame, sigma: float) -> LowOrder:
         if by_circle < found.cost:
             found = LowOrder(by_circle, True, True, axes)
     return found
+
+
+def _costs(sums: Sums, rows: int) -> Array:
+    """Criteria of polynomials of the degrees that so many scans allow."""
+    sizes = tuple(size for size, least in zip(ORDERS, (1, 5, 8, 12), strict=True) if rows >= least)
+    return chi_squares(sums, sizes) + PRICE * np.array(sizes)
 
 
 def _cost_of_cylinder(blocks: Blocks, axes: Array | None, sigma: float) -> float:
@@ -120,10 +134,20 @@ def _joined(context: Context, a: _Region, b: _Region) -> _Region | None:
     lowest = np.min(np.abs(height))
     if not curved and lowest > 0.3:
         return None
+    limit = a.cost + b.cost + context.slack * float(b.blocks.counts.sum())
+    if not curved and _far_from_one(context, a, b, limit):
+        return None
     joint = _region(context, a.members + b.members)
-    if _same_side(joint) and joint.cost < a.cost + b.cost + context.slack * float(b.blocks.counts.sum()):
-        return joint
-    return None
+    return joint if _same_side(joint) and joint.cost < limit else None
+
+
+def _far_from_one(context: Context, a: _Region, b: _Region, limit: float) -> bool:
+    """Whether a flat region would have to give up far too much for another: told over its own frame, at little cost."""
+    if a.bent or len(a.blocks.counts) < VAULT // 4:
+        return False
+    rows = len(np.union1d(a.blocks.row, b.blocks.row))
+    joint = a.sums.plus(sums_of(a.frame, b.blocks, context.sigma))
+    return bool(_costs(joint, rows).min() > FAR * limit)
 
 
 def _same_side(region: _Region) -> bool:

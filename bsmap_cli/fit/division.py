@@ -73,7 +73,6 @@ def find_faces(grid: BeamGrid) -> Faces:
             labels[pieces.row[k], pieces.start[k] : pieces.stop[k]] = number
     labels = _renumber(labels, grid)
     fitted = _fit_all(grid, labels, sigma)
-    rng = np.random.default_rng(0)
     misses = None
     for step in range(ROUNDS):
         fields = [f.field for f in fitted]
@@ -84,7 +83,7 @@ def find_faces(grid: BeamGrid) -> Faces:
         misses = misses._replace(labels=without_alike(grid, misses, sigma))
         divided = without_slipped_ends(grid, misses, fields, sigma)
         if step < ROUNDS - 1:
-            divided = find_planes(grid, divided, sigma, rng)
+            divided = find_planes(grid, divided, sigma)
             labels, fitted = _fit_changed(grid, labels, divided, fitted, sigma)
             after = absorb(grid, labels, [f.field for f in fitted], sigma)
             if np.any(after != labels):
@@ -204,31 +203,33 @@ def _is_flat(field: HeightField) -> bool:
 
 
 def _fit(grid: BeamGrid, member: NDArray[np.bool_], blocks: Blocks, sigma: float) -> Fitted:
-    base = choose_base(blocks, sigma)
-    return fit_heights(blocks, base, *_rectangle(grid, member, base), sigma)
+    fits = [fit_heights(blocks, base, *_rectangle(grid, member, base), sigma) for base in bases(blocks, sigma)]
+    return min(fits, key=lambda fitted: fitted.criterion)
 
 
 def _refit_all(grid: BeamGrid, labels: IntArray, fields: list[HeightField], sigma: float) -> list[Fitted]:
     """Faces fitted anew on their knots; where the beams now ask for the other kind of base, from the beginning."""
     out = []
     for number, (field, blocks) in enumerate(zip(fields, blocks_of_faces(grid, labels), strict=True)):
-        same = type(choose_base(blocks, sigma)) is type(field.base)
+        same = any(type(base) is type(field.base) for base in bases(blocks, sigma))
         out.append(refit(field, blocks, sigma) if same else _fit(grid, labels == number, blocks, sigma))
     return out
 
 
-def choose_base(blocks: Blocks, sigma: float) -> Base:
-    """Plane, or vertical cylinder or one with another axis where that is what the blocks lie on."""
+def bases(blocks: Blocks, sigma: float) -> list[Base]:
+    """Plane, or vertical cylinder or one with another axis where that is what the blocks lie on; both where neither."""
     frame = fit_plane_frame(blocks)
     low = low_order_cost(blocks, frame, sigma)
+    plane = plane_base(blocks.points, frame.axes[:, 2])
     if low.is_round:
         blocks = turned(blocks, low.axes)
         found = fit_cylinder_frame(blocks)
         if found is not None:
             angles = np.arctan2(*(blocks.points[:, :2] - found.centre).T[::-1])
             middle = float(np.angle(np.mean(np.exp(1j * angles))))
-            return CylinderBase(found.centre, found.radius, middle, low.axes)
-    return plane_base(blocks.points, frame.axes[:, 2])
+            cylinder = CylinderBase(found.centre, found.radius, middle, low.axes)
+            return [cylinder, plane] if low.poor else [cylinder]
+    return [plane]
 
 
 def _rectangle(grid: BeamGrid, member: NDArray[np.bool_], base: Base) -> tuple[Array, Array]:

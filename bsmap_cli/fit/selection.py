@@ -25,7 +25,8 @@ PRICE = 5.0
 number of data (BIC), which leaves gentle arcs flat."""
 HIGHEST_DEGREE = 3
 SMOOTH = 0.3
-"""Metres: second differences of the heights are of this size or less. Only where there are no data does it matter."""
+"""Metres: second differences of the heights are of this size or less, and no larger than the spans are long. Only where
+there are no data does it matter."""
 ROBUST = 3.0
 """Standard deviations beyond which a block counts less (Huber)."""
 LEAST_BLOCKS = 4.0
@@ -50,6 +51,7 @@ class _Data(NamedTuple):
     """Feet (n,) of the blocks; heights wanted there and roots of the weights, standard deviations.
 
     places : along s and t, number of distinct parameters, to a thousandth.
+    size : (2,) metres of the rectangle along s and t.
     bases : basis functions at the feet that were computed so far, by direction, degree and knots; along s times `root`.
     """
 
@@ -57,6 +59,7 @@ class _Data(NamedTuple):
     wanted: Array
     root: Array
     places: tuple[int, int]
+    size: Array
     bases: dict[tuple[int, int, bytes], Array]
 
     def basis(self, axis: int, degree: int, knots: Array) -> Array:
@@ -134,7 +137,7 @@ def _linearise(field: HeightField, blocks: Blocks, sigma: float, near: _Data | N
     robust = np.sqrt(np.minimum(1.0, ROBUST * scale / np.maximum(size, 1e-12)))
     root = root * robust / np.abs(feet.slope)
     places = _places(feet.uv[:, 0]), _places(feet.uv[:, 1])
-    return _Data(feet, wanted * root, root, places, {})
+    return _Data(feet, wanted * root, root, places, field.high - field.low, {})
 
 
 def _places(u: Array) -> int:
@@ -152,7 +155,7 @@ def _solve(knots: Knots, data: _Data) -> _Solution:
     """Least squares on given knots."""
     N, y = _rows(knots, data), data.wanted
     A, b = N.T @ N, N.T @ y
-    information = A + smoothness(knots)
+    information = A + smoothness(knots, data.size)
     scale = 1.0 / np.sqrt(information.diagonal())
     scaled = information * scale[:, None] * scale
     scaled.flat[:: len(A) + 1] += 1e-12
@@ -161,18 +164,24 @@ def _solve(knots: Knots, data: _Data) -> _Solution:
     return _Solution(knots, heights, information, float(residuals @ residuals))
 
 
-def smoothness(knots: Knots) -> Array:
-    """Information of second differences of neighbouring heights (first mixed ones of a bilinear patch are free)."""
-    return _smoothness(*knots.shape)
+def smoothness(knots: Knots, size: Array | None = None) -> Array:
+    """Information of second differences of neighbouring heights (first mixed ones of a bilinear patch are free).
+
+    size : (2,) metres of the rectangle; where not given, spans are taken to be longer than SMOOTH.
+    """
+    spans = np.array(knots.shape) - (knots.degree_s, knots.degree_t)
+    loose = np.full(2, SMOOTH) if size is None else np.minimum(SMOOTH, size / spans)
+    along_s, along_t, every = _smoothness(*knots.shape)
+    return along_s / loose[0] ** 2 + along_t / loose[1] ** 2 + every
 
 
 @lru_cache(maxsize=256)
-def _smoothness(ns: int, nt: int) -> Array:
-    out = np.zeros((ns * nt, ns * nt))
-    for rows in (np.kron(_second(ns), np.eye(nt)), np.kron(np.eye(ns), _second(nt))):
-        out += rows.T @ rows / SMOOTH**2
-    out += 1e-6 / SMOOTH**2 * np.eye(len(out))
-    out.flags.writeable = False
+def _smoothness(ns: int, nt: int) -> tuple[Array, Array, Array]:
+    """Squares of second differences along s and along t, and what keeps heights that no others bear."""
+    rows = np.kron(_second(ns), np.eye(nt)), np.kron(np.eye(ns), _second(nt))
+    out = rows[0].T @ rows[0], rows[1].T @ rows[1], 1e-6 / SMOOTH**2 * np.eye(ns * nt)
+    for matrix in out:
+        matrix.flags.writeable = False
     return out
 
 

@@ -74,12 +74,13 @@ def _region(context: Context, members: Sequence[int]) -> _Region:
 class LowOrder(NamedTuple):
     """Least criterion of a low-order surface; whether that is a cylinder, and its frame where it is not vertical.
 
-    bent : whether a plane would not do.
+    bent : whether a plane would not do.  poor : whether no surface of low order would.
     """
 
     cost: float
     is_round: bool
     bent: bool
+    poor: bool
     axes: Array | None = None
 
 
@@ -95,16 +96,16 @@ def _low_order_cost(blocks: Blocks, sums: Sums, sigma: float) -> LowOrder:
     costs = _costs(sums, len(np.unique(blocks.row)))
     best = int(np.argmin(costs))
     poor = 2.0 * len(blocks.counts) + 50.0
-    found = LowOrder(float(costs[best]), False, best > 0)
+    found = LowOrder(float(costs[best]), False, best > 0, bool(costs[best] > poor))
     # A plane, or what nearly is one, is no cylinder.
     if best > 0 or costs[0] > poor:
         by_circle = _cost_of_cylinder(blocks, None, sigma)
         if by_circle < found.cost:
-            found = LowOrder(by_circle, True, True)
+            found = LowOrder(by_circle, True, True, by_circle > poor)
     if best > 0 and found.cost > poor and len(blocks.counts) >= VAULT and (axes := fit_axis(blocks)) is not None:
         by_circle = _cost_of_cylinder(blocks, axes, sigma) + 2 * PRICE
         if by_circle < found.cost:
-            found = LowOrder(by_circle, True, True, axes)
+            found = LowOrder(by_circle, True, True, by_circle > poor, axes)
     return found
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bsmap_cli.errors import BsmapError, ParameterError
 from bsmap_cli.fit.blocks import Blocks
 from bsmap_cli.fit.coverage import cover
-from bsmap_cli.fit.division import choose_base
+from bsmap_cli.fit.division import bases
 from bsmap_cli.fit.growing import (
     BEND,
     FINEST_NOISE,
@@ -229,7 +229,7 @@ def _choose(points: Array, normals: Array, sigma: float) -> Base:
     main = np.linalg.eigh(normals.T @ normals)[1][:, -1]
     if _spread(normals) < WIDEST:
         rough = plane_base(points, main)
-        return choose_base(_blocks(points, rough, _block_size(rough.local(points), len(points))), sigma)
+        return bases(_blocks(points, rough, _block_size(rough.local(points), len(points))), sigma)[0]
     cells = group(points, points, 2.0 * _block_size(points, len(points)))
     first = np.unique(cells.of_point, return_index=True)[1]
     row = ((cells.points[:, 2] - cells.points[:, 2].min()) / 0.1).astype(np.int64)

@@ -212,7 +212,7 @@ def _refit_all(grid: BeamGrid, labels: IntArray, fields: list[HeightField], sigm
     out = []
     for number, (field, blocks) in enumerate(zip(fields, blocks_of_faces(grid, labels), strict=True)):
         same = any(type(base) is type(field.base) for base in bases(blocks, sigma))
-        out.append(refit(field, blocks, sigma) if same else _fit(grid, labels == number, blocks, sigma))
+        out.append(refit(field, blocks, sigma, True) if same else _fit(grid, labels == number, blocks, sigma))
     return out
 
 

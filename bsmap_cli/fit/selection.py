@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bsmap_cli.core.bspline import design_matrix
+from bsmap_cli.core.bspline import clamped_knots, design_matrix, inner_knots
 from bsmap_cli.fit.blocks import Blocks
 from bsmap_cli.fit.feet import Met, meet, tabulate
 from bsmap_cli.fit.heights import (
@@ -51,7 +51,7 @@ class _Data(NamedTuple):
     """Feet (n,) of the blocks; heights wanted there and roots of the weights, standard deviations.
 
     places : along s and t, number of distinct parameters, to a thousandth.
-    size : (2,) metres of the rectangle along s and t.
+    least : knots of the least surface.  size : (2,) metres of the rectangle along s and t.
     bases : basis functions at the feet that were computed so far, by direction, degree and knots; along s times `root`.
     """
 
@@ -59,6 +59,7 @@ class _Data(NamedTuple):
     wanted: Array
     root: Array
     places: tuple[int, int]
+    least: Knots
     size: Array
     bases: dict[tuple[int, int, bytes], Array]
 
@@ -99,7 +100,7 @@ def fit_heights(blocks: Blocks, base: Base, low: Array, high: Array, sigma: floa
     data = _linearise(field, blocks, sigma)
     best = _solve(knots, data)
     # First roughly; pairs of steps are tried about the surface that this gives.
-    for kinds in ((_single_steps,), (_single_steps, _double_steps)):
+    for kinds in ((_single_steps,), (_single_steps, _double_steps, _fewer_steps)):
         best = _climb(best, data, kinds)
         field = best.on(field)
         data = _linearise(field, blocks, sigma, data)
@@ -107,9 +108,13 @@ def fit_heights(blocks: Blocks, base: Base, low: Array, high: Array, sigma: floa
     return _settled(best.on(field), blocks, sigma, data)
 
 
-def refit(field: HeightField, blocks: Blocks, sigma: float) -> Fitted:
-    """Fit on the degrees and knots that a field has."""
-    return _settled(field, blocks, sigma, None)
+def refit(field: HeightField, blocks: Blocks, sigma: float, fewer: bool = False) -> Fitted:
+    """Fit on the degrees and knots that a field has; fewer: without those that do not pay."""
+    if not fewer or field.knots.size == least_knots(field.base, field.low, field.high).size:
+        return _settled(field, blocks, sigma, None)
+    data = _linearise(field, blocks, sigma)
+    best = _climb(_solve(field.knots, data), data, (_fewer_steps,))
+    return _settled(best.on(field), blocks, sigma, data)
 
 
 def _settled(field: HeightField, blocks: Blocks, sigma: float, data: _Data | None) -> Fitted:
@@ -137,7 +142,8 @@ def _linearise(field: HeightField, blocks: Blocks, sigma: float, near: _Data | N
     robust = np.sqrt(np.minimum(1.0, ROBUST * scale / np.maximum(size, 1e-12)))
     root = root * robust / np.abs(feet.slope)
     places = _places(feet.uv[:, 0]), _places(feet.uv[:, 1])
-    return _Data(feet, wanted * root, root, places, field.high - field.low, {})
+    least = least_knots(field.base, field.low, field.high)
+    return _Data(feet, wanted * root, root, places, least, field.high - field.low, {})
 
 
 def _places(u: Array) -> int:
@@ -229,6 +235,17 @@ def _double_steps(knots: Knots, data: _Data, misfit: Array) -> Iterator[Knots]:
                 yield _with(knots, axis, new)
         if halved is not None and (new := _halved(halved, data, axis, misfit)) is not None:
             yield _with(knots, axis, new)
+
+
+def _fewer_steps(knots: Knots, data: _Data, misfit: Array) -> Iterator[Knots]:
+    """Knots without one of the inner ones, or of a lower degree along s or t: what later steps have made needless."""
+    for axis in (0, 1):
+        old, least = _along(knots, axis), _along(data.least, axis)
+        inner = inner_knots(old.knots, old.degree)
+        for k in np.flatnonzero(~np.isin(inner, inner_knots(least.knots, least.degree))).tolist():
+            yield _with(knots, axis, _Line(old.degree, clamped_knots(old.degree, np.delete(inner, k))))
+        if old.degree > least.degree:
+            yield _with(knots, axis, _Line(old.degree - 1, clamped_knots(old.degree - 1, inner)))
 
 
 class _Line(NamedTuple):

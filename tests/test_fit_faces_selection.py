@@ -1,0 +1,77 @@
+"""Knots of height fields: needless ones leave, those that the data pay for stay."""
+
+import numpy as np
+import pytest
+
+from bsmap_cli.core.bspline import clamped_knots, inner_knots, open_knots
+from bsmap_cli.fit.blocks import Blocks
+from bsmap_cli.fit.heights import CylinderBase, HeightField, Knots, PlaneBase, least_knots
+from bsmap_cli.fit.selection import PRICE, fit_heights, refit
+
+SIGMA = 0.01
+PLANE = PlaneBase(np.zeros(3), np.eye(3))
+LOW, HIGH = np.zeros(2), np.array([4.0, 2.0])
+
+
+def blocks_of(height, seed=0, until=4.0):
+    """Blocks on a height over (s, t) with noise, seen from above, up to s = `until`."""
+    rng = np.random.default_rng(seed)
+    s, t = rng.uniform(0.0, (until, 2.0), (3000, 2)).T
+    points = np.column_stack([s, t, height(s, t) + SIGMA * rng.standard_normal(len(s))])
+    down, one = np.tile([0.0, 0.0, -1.0], (len(s), 1)), np.ones(len(s))
+    return Blocks(points, down, one, np.arange(len(s)) // 30, one, np.arange(len(s)))
+
+
+def field_on(knots):
+    return HeightField(PLANE, LOW, HIGH, knots, np.zeros(knots.shape))
+
+
+def many_knots():
+    return Knots(3, 2, clamped_knots(3, np.array([0.25, 0.5, 0.75])), clamped_knots(2, np.array([0.5])))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_all_knots_of_a_flat_face_leave(seed):
+    fitted = refit(field_on(many_knots()), blocks_of(lambda s, t: 0.1 * s - 0.2 * t, seed), SIGMA, fewer=True)
+    assert fitted.field.knots.size == 4
+
+
+def test_the_knot_at_a_bend_stays():
+    blocks = blocks_of(lambda s, t: 0.1 * np.maximum(s - 2.0, 0.0) ** 2)
+    knots = Knots(2, 1, clamped_knots(2, np.array([0.2, 0.5, 0.7])), open_knots(1))
+    fitted = refit(field_on(knots), blocks, SIGMA, fewer=True)
+    np.testing.assert_array_equal(inner_knots(fitted.field.knots.s, fitted.field.knots.degree_s), [0.5])
+
+
+def test_least_surface_over_a_cylinder_keeps_its_knots():
+    rng = np.random.default_rng(0)
+    angle, z = rng.uniform(-2.0, 2.0, 3000), rng.uniform(0.0, 2.0, 3000)
+    outwards = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))])
+    points = outwards * (1.0 + SIGMA * rng.standard_normal(len(angle)))[:, None] + z[:, None] * [0.0, 0.0, 1.0]
+    one = np.ones(len(angle))
+    blocks = Blocks(points, outwards, one, np.arange(len(angle)) // 30, one, np.arange(len(angle)))
+    base, low, high = CylinderBase(np.zeros(2), 1.0, 0.0), np.array([-2.0, 0.0]), np.array([2.0, 2.0])
+    least = least_knots(base, low, high)
+    knots = Knots(3, 2, clamped_knots(3, np.array([0.25, 0.5, 0.75])), open_knots(2))
+    fitted = refit(HeightField(base, low, high, knots, np.zeros(knots.shape)), blocks, SIGMA, fewer=True)
+    assert fitted.field.knots.shape == least.shape
+    assert fitted.field.knots.degree_s == least.degree_s
+
+
+def test_a_knot_whose_data_have_gone_to_another_face_leaves():
+    blocks = blocks_of(lambda s, t: 0.02 * s**2, until=3.0)
+    knots = Knots(2, 1, clamped_knots(2, np.array([0.75, 0.9])), open_knots(1))
+    fitted = refit(field_on(knots), blocks, SIGMA, fewer=True)
+    assert fitted.field.knots.shape == (3, 2)
+    np.testing.assert_allclose(fitted.field.heights[-1], 0.02 * 16.0, atol=0.02)
+
+
+def test_fewer_knots_are_never_the_worse_choice():
+    for seed in range(3):
+        blocks = blocks_of(lambda s, t: 0.03 * np.sin(2.0 * s) * np.cos(t), seed)
+        kept = refit(field_on(many_knots()), blocks, SIGMA)
+        fewer = refit(field_on(many_knots()), blocks, SIGMA, fewer=True)
+        assert fewer.criterion <= kept.criterion + 1e-6
+        chosen = fit_heights(blocks, PLANE, LOW, HIGH, SIGMA)
+        again = refit(chosen.field, blocks, SIGMA, fewer=True)
+        assert again.criterion > chosen.criterion - PRICE

@@ -7,6 +7,7 @@ from face_maps import floor, map_of, plate
 from bsmap_cli.merge import merge_surfaces
 from bsmap_cli.merge.bases import based_face, field_of
 from bsmap_cli.merge.rings import Ring
+from bsmap_cli.merge.topology import Edge, Topology, without_twice
 from bsmap_cli.merge.untangling import untangled
 from bsmap_cli.model import Crease
 from bsmap_cli.params import MergeParams
@@ -70,3 +71,16 @@ def test_strip_of_wall_between_floor_and_ceiling_keeps_its_width(width):
     result = merge_surfaces([map_of(strip, wall, *flat, creases=lines)], MergeParams())
     areas = {surface.name: based_face(surface).area for surface in result.surfaces}
     assert areas["a/1"] == pytest.approx(2.0 * width, abs=1e-3)
+
+
+def test_edge_along_which_one_face_runs_twice_is_none():
+    """A hole that touches the outline along a crease: there the face ends at no crease."""
+    square = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0]])
+    hole = np.array([[2.0, 0, 0], [1, 0, 0], [1.5, 0.5, 0]])
+    edges = [Edge((0, 1), square[k : k + 2], (-1, -1)) for k in (0, 1)]
+    rings = {0: [Ring(square, np.array([0, 1, -1, -1, -1])), Ring(hole, np.array([1, -1, -1]))]}
+    rings[1] = [Ring(square[:, [0, 2, 1]], np.array([0, 1, -1, -1, -1]))]
+    found = without_twice(Topology(rings, edges, np.zeros((0, 3))))
+    assert len(found.edges) == 1
+    assert [ring.edges.tolist() for ring in found.rings[0]] == [[0, -1, -1, -1, -1], [-1, -1, -1]]
+    assert found.rings[1][0].edges.tolist() == [0, -1, -1, -1, -1]

@@ -60,9 +60,9 @@ def merge_surfaces(maps: Sequence[SurfaceMap], params: MergeParams, *, track: Tr
         if len(maps) < 2:
             raise ParameterError("align: one map alone can be laid over no other one")
         maps, placements = bring_together(maps, params, track=track)
-    united, survey, survey_of_set, folds = unite(maps)
+    united, survey, survey_of_set, settled = unite(maps)
     surfaces, trimmed = separate_faces(united.surfaces)
-    faces = merge_faces(trimmed, united.creases, survey, params, track=track) if trimmed else no_faces()
+    faces = merge_faces(trimmed, united.creases, survey, settled, params, track=track) if trimmed else no_faces()
     taken = {surface.name for surface in united.surfaces}
     search = _Search(params, dict(enumerate(make_patch(surface) for surface in surfaces)))
     search.neighbours = {number: set() for number in search.patches}
@@ -81,7 +81,7 @@ def merge_surfaces(maps: Sequence[SurfaceMap], params: MergeParams, *, track: Tr
     merged = tuple(patch.surface for patch in search.patches.values())
     decisions = (*united.decisions, *faces.decisions, *search.decisions)
     summed = Summed([*merged, *faces.surfaces], united.data_sets)
-    if folds:
+    if len(maps) > 1 and settled:
         summed = sum_up(*summed, survey_of_set)
     creases, corners = tuple(faces.creases), faces.corners
     return SurfaceMap(

@@ -1,26 +1,33 @@
 """Faces of the map from what they are joined of: outlines, creases and corners, surfaces with covariance and names."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import shapely
 
 from bsmap_cli.fit.heights import HeightField, PlaneBase
 from bsmap_cli.fit.surfaces import spline_over
-from bsmap_cli.merge.bases import BasedFace
+from bsmap_cli.merge.bases import BasedFace, normals
 from bsmap_cli.merge.curves import FacePair
 from bsmap_cli.merge.extent import trimmed
 from bsmap_cli.merge.frames import Frame
 from bsmap_cli.merge.information import Joined, Told, covariance_of
+from bsmap_cli.merge.layers import CLOSE, cut_back
 from bsmap_cli.merge.open_borders import fewer_vertices
-from bsmap_cli.merge.outlines import creased_sides, member_of, outline, snapped
+from bsmap_cli.merge.outlines import creased_sides, loops_around, member_of, seen, snapped
+from bsmap_cli.merge.regions import Region
 from bsmap_cli.merge.shapes import Shape, spline_shape
 from bsmap_cli.merge.topology import Topology, find_topology
 from bsmap_cli.merge.untangling import untangled
 from bsmap_cli.model import Array, BSplineSurface, Crease, Residuals
+from bsmap_cli.params import MergeParams
 
 JOINED = "face-"
 """Names of joined faces begin with it."""
+
+ROUNDS = 3
+"""In which faces that lie on others are cut back: outlines move a little with each."""
 
 
 class Group(NamedTuple):
@@ -37,7 +44,11 @@ class Group(NamedTuple):
 
 
 def assemble(
-    groups: Sequence[Group], others: Sequence[BSplineSurface], creases: Sequence[Crease], gap: float
+    groups: Sequence[Group],
+    others: Sequence[BSplineSurface],
+    creases: Sequence[Crease],
+    near: Collection[tuple[int, int]],
+    params: MergeParams,
 ) -> tuple[list[BSplineSurface], list[Crease], Array]:
     """Surfaces, creases and corners (k, 3) of the map.
 
@@ -45,7 +56,7 @@ def assemble(
     ----------
     others : surfaces over other bases than planes and cylinders, each a face of the map by itself.
     creases : of the data sets.
-    gap : metres between parts of a face, or between creases and corners, that are closed.
+    near : pairs of groups that are one layer where they lie on each other.
     """
     names = _names(groups, others)
     whole = [_surface(group, names[k]) for k, group in enumerate(groups)] + list(others)
@@ -56,19 +67,58 @@ def assemble(
     surfaces = [[face.surface for face in group.faces] for group in groups] + [[surface] for surface in others]
     pairs = [_pair(crease, number_of) for crease in creases]
     members = [[snapped(member_of(s, pairs), k, shapes) for s in some] for k, some in enumerate(surfaces)]
-    outlines: dict[int, Sequence[Array]] = {}
-    for number, group in enumerate(groups):
-        sets = [" ".join(surface.data_sets) for surface in surfaces[number]]
-        if loops := outline(members[number], sets, group.field, gap):
-            outlines[number] = loops
+    fields = {number: group.field for number, group in enumerate(groups)}
+    regions = {
+        number: seen(members[number], [" ".join(s.data_sets) for s in surfaces[number]], field, params.gap)
+        for number, field in fields.items()
+    }
+    outlines = _outlines({number: region.whole for number, region in regions.items()}, fields)
     outlines |= {number: members[number][0].corners for number in range(len(groups), len(surfaces))}
     sides = creased_sides(member for some in members for member in some)
-    found = find_topology(outlines, sides, shapes, gap)
+    found = find_topology(outlines, sides, shapes, params.gap)
+    for _ in range(ROUNDS):
+        cut = cut_back(found.rings, regions, fields, near, params.distance)
+        if not cut:
+            break
+        kept = {number: loops for number, loops in outlines.items() if number not in cut}
+        outlines = kept | _outlines(cut, fields)
+        found = find_topology(outlines, sides, shapes, params.gap)
     made = []
     for number, rings in found.rings.items():
         simple = untangled(fewer_vertices(rings, shapes[number]), shapes[number])
         made.append(trimmed(whole[number], simple, shapes[number]))
     return made, _creases(found, names), found.corners
+
+
+def _outlines(regions: Mapping[int, Region], fields: Mapping[int, HeightField]) -> dict[int, Sequence[Array]]:
+    """Loops of the faces, by number, of which there is anything."""
+    found = {number: loops_around(region, fields[number]) for number, region in regions.items()}
+    return {number: loops for number, loops in found.items() if loops}
+
+
+def neighbours(groups: Sequence[Group], survey: Mapping[str, int]) -> list[tuple[int, int]]:
+    """Numbers of groups over planes that lie near each other, were seen by one survey, and not from opposite sides.
+
+    survey : number of the survey of each surface, by name; of those in a map already, which may show what moved, none.
+    """
+    flat = [number for number, group in enumerate(groups) if isinstance(group.field.base, PlaneBase)]
+    if not flat:
+        return []
+    samples = [np.concatenate([face.samples for face in groups[k].faces]) for k in flat]
+    low, high = np.array([s.min(axis=0) for s in samples]), np.array([s.max(axis=0) for s in samples])
+    boxes = shapely.box(low[:, 0] - CLOSE, low[:, 1] - CLOSE, high[:, 0] + CLOSE, high[:, 1] + CLOSE)
+    a, b = shapely.STRtree(boxes).query(boxes)
+    level = (low[a, 2] < high[b, 2] + CLOSE) & (low[b, 2] < high[a, 2] + CLOSE)
+    names = [{face.surface.name for face in group.faces} & survey.keys() for group in groups]
+    surveys = [{survey[name] for name in some} for some in names]
+    looks = [_looks(group) for group in groups]
+    found = ((flat[i], flat[j]) for i, j in zip(a[level].tolist(), b[level].tolist(), strict=True) if i < j)
+    return [(i, j) for i, j in found if surveys[i] & surveys[j] and looks[i] @ looks[j] >= 0.0]
+
+
+def _looks(group: Group) -> Array:
+    """(3,) sum of the members' normals towards their sensors; 0 where they do not tell."""
+    return np.sum([face.facing * normals(face.field.base, face.samples[:1])[0] for face in group.faces], axis=0)
 
 
 def _creases(found: Topology, names: Mapping[int, str]) -> list[Crease]:

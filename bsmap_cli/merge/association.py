@@ -36,10 +36,19 @@ class _Groups(NamedTuple):
     apart: list[dict[int, Pair]]
 
 
-def associate(
-    faces: Sequence[BasedFace], survey: Mapping[str, int], params: MergeParams
-) -> tuple[list[list[int]], list[Decision]]:
-    """Groups of faces, each one physical face, and decisions: of each joining, and of two groups why they stay apart.
+class Associated(NamedTuple):
+    """Groups of faces, by number, each one physical face.
+
+    decisions : of each joining, and of two groups why they stay apart.  pairs : that were compared.
+    """
+
+    groups: list[list[int]]
+    decisions: list[Decision]
+    pairs: list[Pair]
+
+
+def associate(faces: Sequence[BasedFace], survey: Mapping[str, int], params: MergeParams) -> Associated:
+    """Put together faces that are one.
 
     Pairs of the same data set are never joined directly, and no two groups that hold such a pair at an offset.
 
@@ -59,7 +68,7 @@ def associate(
         elif reason is not None and (not pair.same or pair.opposite):
             refused.append((pair, reason))
     decisions = [*joined, *_refusals(faces, _with_moved(faces, refused, groups.of, survey), groups.of)]
-    return [sorted(found) for found in sorted(groups.members.values(), key=min)], decisions
+    return Associated([sorted(found) for found in sorted(groups.members.values(), key=min)], decisions, pairs)
 
 
 def _compared(faces: Sequence[BasedFace], gate: float, params: MergeParams) -> list[Pair]:

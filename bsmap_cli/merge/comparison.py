@@ -5,15 +5,27 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
 from bsmap_cli.fit.heights import evaluate
 from bsmap_cli.merge.bases import BasedFace, height_variances, normals, pose_variances
 from bsmap_cli.merge.regions import Region
-from bsmap_cli.model import Array
+from bsmap_cli.model import Array, IntArray
 from bsmap_cli.params import MergeParams
 
 LARGEST_ANGLE = np.radians(25.0)
 """Between the base planes of faces that are compared at all; whether they agree is told by their heights."""
+
+
+class Heights(NamedTuple):
+    """Of one face's samples, those inside another face: their numbers (k,), how far they lie above it, metres, by which
+    variances that differs from 0 by chance, and the variances (k,) of the other face alone, sensor part.
+    """
+
+    numbers: IntArray
+    heights: Array
+    variances: Array
+    of_other: Array
 
 
 class Pair(NamedTuple):
@@ -21,6 +33,7 @@ class Pair(NamedTuple):
 
     area : square metres that both have.  offset : metres, root mean square between them there, or at the border.
     distance : squared Mahalanobis distance of one degree of freedom, mean.  same : whether a data set has both.
+    heights : where they overlap, of the first above the second, and the other way round.
     """
 
     first: int
@@ -30,6 +43,7 @@ class Pair(NamedTuple):
     distance: float
     same: bool
     opposite: bool
+    heights: tuple[Heights, Heights]
 
 
 class Comparison(NamedTuple):
@@ -82,41 +96,54 @@ def _turned(one: BasedFace, other: BasedFace) -> float:
 
 
 class _Offsets(NamedTuple):
-    """Of one face's samples that lie on another face or beside it: heights, variances, areas, whether on it."""
+    """Of one face's samples that lie on another face or beside it: heights, variances, areas, whether on it; numbers,
+    and variances of the other face alone.
+    """
 
     heights: Array
     variances: Array
     areas: Array
-    inside: Array
+    inside: NDArray[np.bool_]
+    numbers: IntArray
+    of_other: Array
+
+    def overlap(self) -> Heights:
+        """Of what lies on it, not at the border."""
+        some = self.inside & (self.areas > 0.0)
+        return Heights(self.numbers[some], self.heights[some], self.variances[some], self.of_other[some])
+
+
+_NONE = np.zeros(0)
+NOTHING = _Offsets(_NONE, _NONE, _NONE, np.zeros(0, dtype=bool), np.zeros(0, dtype=np.int64), _NONE)
 
 
 def compare(comparison: Comparison, a: int, b: int) -> Pair | None:
     """Both compared where they overlap, else where they touch; None where they do neither within reach."""
     one, other = comparison.faces[a], comparison.faces[b]
     both = [_offsets(comparison, a, b), _offsets(comparison, b, a)]
-    h, variance, areas, inside = (np.concatenate(parts) for parts in zip(*both, strict=True))
+    h, variance, areas, inside, *_ = (np.concatenate(parts) for parts in zip(*both, strict=True))
     # Where they overlap, what lies beside says no more.
-    used = inside > 0.0 if np.any((inside > 0.0) & (areas > 0.0)) else np.ones(len(h), dtype=bool)
+    used = inside if np.any(inside & (areas > 0.0)) else np.ones(len(h), dtype=bool)
     if not len(h) or np.abs(h[used]).min() > 2.0 * comparison.params.distance:
         return None
     offset = float(np.sqrt(np.mean(h[used] ** 2)))
     distance = float(np.mean(h[used] ** 2 / variance[used]))
     same = bool(set(one.surface.data_sets) & set(other.surface.data_sets))
     looks = one.facing * other.facing * _turned(one, other)
-    area = float(areas[inside > 0.0].sum() / 2.0)
-    return Pair(a, b, area, offset, distance, same, bool(looks < 0.0))
+    area = float(areas[inside].sum() / 2.0)
+    return Pair(a, b, area, offset, distance, same, bool(looks < 0.0), (both[0].overlap(), both[1].overlap()))
 
 
 def _offsets(comparison: Comparison, of: int, to: int) -> _Offsets:
     face, on, params = comparison.faces[of], comparison.faces[to], comparison.params
     local = on.field.base.local(face.samples)
-    within = shapely.contains_xy(comparison.reach[to], local[:, :2])
-    if not within.any():
-        return _Offsets(*np.zeros((4, 0)))
-    points, local = face.samples[within], local[within]
+    numbers = np.flatnonzero(shapely.contains_xy(comparison.reach[to], local[:, :2]))
+    if not len(numbers):
+        return NOTHING
+    points, local = face.samples[numbers], local[numbers]
     uv = on.field.parameters(local)
     h = local[:, 2] - evaluate(on.field, uv)[0]
-    variance = face.variances[within] + height_variances(on.surface, on.field, uv) + 2.0 * params.flatness**2
-    variance += pose_variances(on, face, points)
-    inside = shapely.contains_xy(on.region, local[:, :2]).astype(float)
-    return _Offsets(h, variance, face.areas[within], inside)
+    of_other = height_variances(on.surface, on.field, uv)
+    variance = face.variances[numbers] + of_other + 2.0 * params.flatness**2 + pose_variances(on, face, points)
+    inside = np.asarray(shapely.contains_xy(on.region, local[:, :2]), dtype=bool)
+    return _Offsets(h, variance, face.areas[numbers], inside, numbers, of_other)

@@ -1,16 +1,17 @@
 """Trimmed faces of data sets -> faces of the map, every physical face once."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from bsmap_cli.fit.heights import PlaneBase
 from bsmap_cli.merge.adjustment import Correction, adjust, moved, moved_crease, with_left_over
-from bsmap_cli.merge.assembly import Group, assemble
+from bsmap_cli.merge.assembly import Group, assemble, neighbours
 from bsmap_cli.merge.association import associate
 from bsmap_cli.merge.bases import BasedFace, based_face, has_base
 from bsmap_cli.merge.changes import MOVED, find_changes
+from bsmap_cli.merge.denial import denied_faces
 from bsmap_cli.merge.frames import common_frame
 from bsmap_cli.merge.information import join, tell
 from bsmap_cli.model import Array, BSplineSurface, Crease, Decision
@@ -37,6 +38,7 @@ def merge_faces(
     surfaces: Sequence[BSplineSurface],
     creases: Sequence[Crease],
     survey: Mapping[str, int],
+    settled: Collection[int],
     params: MergeParams,
     *,
     track: Track = silent,
@@ -50,11 +52,12 @@ def merge_faces(
     ----------
     surfaces : trimmed surfaces of all data sets.  creases : to which their trims refer.
     survey : number of the survey that each surface stems from, by name.
+    settled : numbers of those that are maps already.
     """
     surfaces = sorted(surfaces, key=_key)
     faces = [face for s in surfaces if has_base(s) and (face := based_face(s)) is not None]
     track("merging faces", 0, 2)
-    groups = _groups(faces, associate(faces, survey, params)[0], params)
+    groups = _groups(faces, associate(faces, survey, params).groups, params)
     # Pillars bear what the path errs by within a data set more than they tell of its pose (1 cm off in a corridor).
     corrections = adjust([(g.told, g.joined) for g in groups if g.joined and isinstance(g.field.base, PlaneBase)])
     track("merging faces", 1, 2)
@@ -64,14 +67,18 @@ def merge_faces(
         surfaces = [moved(surface, corrections) for surface in surfaces]
         faces = [face for s in surfaces if has_base(s) and (face := based_face(s)) is not None]
     gated = [face._replace(surface=with_left_over(face.surface, corrections)) for face in faces]
-    numbers, decisions = associate(gated, survey, params)
-    groups = _groups(faces, numbers, params)
+    numbers, decisions, pairs = associate(gated, survey, params)
+    asked = {name: number for name, number in survey.items() if number not in settled}
+    denied = denied_faces(gated, pairs, asked, params.distance)
+    decisions += denied.values()
+    left = ([k for k in members if k not in denied] for members in numbers)
+    groups = _groups(faces, [members for members in left if members], params)
     based = {face.surface.name for face in faces}
     others = [surface for surface in surfaces if surface.name not in based]
     track("merging faces", 2, 2)
     told = {name for d in decisions if d.outcome == MOVED for name in (d.first, d.second)}
     decisions += find_changes([[f.surface for f in group.faces] for group in groups], surfaces, survey, told)
-    made, lines, corners = assemble(groups, others, creases, params.gap)
+    made, lines, corners = assemble(groups, others, creases, neighbours(groups, asked), params)
     notes = {
         "faces_before": float(len(surfaces)),
         "faces_after": float(len(made)),

@@ -14,13 +14,13 @@ class United(NamedTuple):
     """All maps in one.
 
     surfaces, data_sets : by name the number of the map (the survey) that they stem from.
-    folds : whether the first is a map already, of joined faces, into which the others are folded.
+    settled : numbers of those that are maps already, of joined faces: what lies close together in them is meant to.
     """
 
     whole: SurfaceMap
     surfaces: dict[str, int]
     data_sets: dict[str, int]
-    folds: bool
+    settled: frozenset[int]
 
 
 def unite(maps: Sequence[SurfaceMap]) -> United:
@@ -49,8 +49,8 @@ def unite(maps: Sequence[SurfaceMap]) -> United:
         survey |= {surface.name: number for surface in m.surfaces}
         survey_of_set |= {data_set.name: number for data_set in m.data_sets}
     whole = SurfaceMap(tuple(surfaces), tuple(data_sets), tuple(decisions), {}, tuple(creases), np.concatenate(corners))
-    folds = len(maps) > 1 and _is_joined(ordered[0])
-    return United(whole, survey, survey_of_set, folds)
+    settled = frozenset(number for number, given in enumerate(ordered) if _is_joined(given))
+    return United(whole, survey, survey_of_set, settled)
 
 
 def _with_corners_from(crease: Crease, start: int) -> Crease:

@@ -51,8 +51,15 @@ def snapped(member: Member, face: int, shapes: Shapes) -> Member:
     return Member(corners, member.sides)
 
 
-def outline(members: Sequence[Member], sets: Sequence[str], field: HeightField, gap: float) -> list[Array]:
-    """Loops (k, 3) around the union of the members' regions, on the surface of their face.
+class Seen(NamedTuple):
+    """Region of a face of the map in s and t of its field's base, and those that each data set saw."""
+
+    whole: Region
+    by_set: dict[str, Region]
+
+
+def seen(members: Sequence[Member], sets: Sequence[str], field: HeightField, gap: float) -> Seen:
+    """Union of the members' regions.
 
     members : snapped.  sets : the data sets of each.
     """
@@ -60,9 +67,13 @@ def outline(members: Sequence[Member], sets: Sequence[str], field: HeightField, 
     for name, member in zip(sets, members, strict=True):
         by_set[name].append(_region(member, field))
     creases = np.concatenate([np.zeros((0, 2, 3)), *creased_sides(members).values()])
-    regions = [shapely.union_all(some) for _, some in sorted(by_set.items())]
-    whole = united(regions, gap, field.base.local(creases)[..., :2])
-    return [_following(ring, field) for ring in loops_of(whole, TOLERANCE)]
+    regions = {name: shapely.union_all(some) for name, some in sorted(by_set.items())}
+    return Seen(united(list(regions.values()), gap, field.base.local(creases)[..., :2]), regions)
+
+
+def loops_around(region: Region, field: HeightField) -> list[Array]:
+    """Loops (k, 3) around a region, on the surface of its face."""
+    return [_following(ring, field) for ring in loops_of(region, TOLERANCE)]
 
 
 def _region(member: Member, field: HeightField) -> Region:

@@ -52,7 +52,7 @@ def united(regions: Sequence[Region], gap: float, creases: Array = NO_SIDES) -> 
         lines = shapely.STRtree(list(shapely.linestrings(creases)))
         between = [part for part in parts(added) if _touched(part, regions) > 1 and not _between(part, lines)]
         whole = shapely.union_all([whole, *between], grid_size=GRID)
-    return _without_specks(whole)
+    return without_specks(whole)
 
 
 def filled(region: Region) -> Region:
@@ -76,7 +76,8 @@ def _touched(part: Region, regions: Sequence[Region]) -> int:
     return int(np.count_nonzero(shapely.distance(part, list(regions)) < 2.0 * GRID))
 
 
-def _without_specks(region: Region) -> Region:
+def without_specks(region: Region) -> Region:
+    """The region, its small parts dropped and small holes closed."""
     kept = []
     for part in parts(region):
         if part.area >= LEAST_AREA:

@@ -5,7 +5,7 @@ both faces of a curve run along, between two corners or free ends, is a crease. 
 from the creases and from what is open. A crease that ends inside another one divides it, for edges meet in corners.
 """
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
 from typing import NamedTuple
@@ -78,7 +78,25 @@ def find_topology(
     rings: dict[int, list[Ring]] = {face: [] for face in outlines}
     for loop in loops:
         rings[loop.face].append(put_together(loop, curves, knots, number_of))
-    return Topology(rings, edges, corners.points[kept])
+    return without_twice(Topology(rings, edges, corners.points[kept]))
+
+
+def without_twice(whole: Topology) -> Topology:
+    """The topology without edges along which one face runs twice: what lies on both sides of an edge ends at none."""
+    count = Counter(
+        (face, int(number))
+        for face, rings in whole.rings.items()
+        for ring in rings
+        for number in ring.edges[ring.edges != np.roll(ring.edges, 1)]
+    )
+    twice = {number for (_, number), runs in count.items() if runs > 1 and number >= 0}
+    if not twice:
+        return whole
+    kept = [number for number in range(len(whole.edges)) if number not in twice]
+    new = np.full(len(whole.edges) + 1, -1)
+    new[kept] = np.arange(len(kept))
+    rings = {face: [ring._replace(edges=new[ring.edges]) for ring in some] for face, some in whole.rings.items()}
+    return whole._replace(rings=rings, edges=[whole.edges[number] for number in kept])
 
 
 def _find_loops(

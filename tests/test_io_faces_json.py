@@ -50,7 +50,7 @@ def test_faces_come_back(path):
     np.testing.assert_array_equal(first.trims[0].creases, [0, -1, -1, -1])
     deviations = np.sqrt(np.diag(made.covariance.matrix))
     off = np.abs(first.covariance.matrix - made.covariance.matrix)
-    assert np.all(off < 2e-8 * np.maximum(deviations[:, None], deviations))
+    assert np.all(off < 0.01 * np.outer(deviations, deviations))
     assert crease.surfaces == ("a", "b")
     assert crease.corners == (0, -1)
     np.testing.assert_array_equal(crease.points, [[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
@@ -59,8 +59,8 @@ def test_faces_come_back(path):
 
 def test_corners_are_stored_once(path):
     plain = json.loads(path.read_text())
-    assert plain["corners"] == [[0.0, 0.0, 0.0]]
-    assert plain["creases"][0]["points"] == [[2.0, 0.0, 0.0]]
+    assert plain["corners"] == [[0, 0, 0]]
+    assert plain["creases"][0]["points"] == [[20_000, 0, 0]]
 
 
 def test_placements_come_back(path):
@@ -108,7 +108,7 @@ def change(plain, value, *way):
 
 
 FIRST = ("surfaces", 0)
-UPWARDS = {"directions": [[[0, 0, 1]]], "pose": []}
+UPWARDS = {"directions": [[[0, 0, 100_000]]], "weights": []}
 
 
 @pytest.mark.parametrize(
@@ -121,12 +121,12 @@ UPWARDS = {"directions": [[[0, 0, 1]]], "pose": []}
         ([0, 1], ("creases", 0, "corners"), r"corners\[1\] is 1, wanted -1 or a number of a corner"),
         ([[0, 0]], ("corners",), r"corners is 1 x 2, wanted any x 3"),
         ([[0, 0], [1, 0]], (*FIRST, "trims", 0, "parameters"), "has 2 vertices, wanted 3 or more"),
-        ([[0, 0], [1, 0], [1, 1], [0, 1.5]], (*FIRST, "trims", 0, "parameters"), r"lie outside \[0, 1\]"),
+        ([[0, 0], [4000, 0], [0, 4000], [-4000, 1]], (*FIRST, "trims", 0, "parameters"), r"lie outside \[0, 1\]"),
         ([0, 0, 1, 0], (*FIRST, "trims", 0, "creases"), r"creases\[2\] is 1, wanted -1 or a number of a crease"),
         ([0, 0, 0], (*FIRST, "trims", 0, "creases"), "creases is 3, wanted 4"),
-        ([[[0, 0, 2]]], (*FIRST, "covariance", "directions"), "directions are not of length 1"),
+        ([[[0, 0, 200_000]]], (*FIRST, "covariance", "directions"), "directions are not of length 1"),
         (
-            [[[0, 0, 1]]] * 3,
+            [[[0, 0, 100_000]]] * 3,
             (*FIRST, "covariance", "directions"),
             "directions is 3 x 1 x 3, wanted 2 or 1 x 2 or 1 x 3",
         ),

@@ -75,18 +75,18 @@ def test_surfaces_come_back_to_what_the_numbers_are_worth(tmp_path: Path, name: 
         assert (one.name, one.data_sets, one.degree_u, one.degree_v) == (other.name, other.data_sets, 3, 3)
         np.testing.assert_allclose(one.knots_u, other.knots_u, atol=1e-10)
         np.testing.assert_allclose(one.knots_v, other.knots_v, atol=1e-10)
-        np.testing.assert_allclose(one.control_points, other.control_points, atol=0.51e-6)
+        np.testing.assert_allclose(one.control_points, other.control_points, atol=0.51e-5)
         np.testing.assert_allclose(one.covariance.blocks, other.covariance.blocks, rtol=0.51e-3)
         np.testing.assert_allclose(one.covariance.correlation_u, other.covariance.correlation_u, atol=0.51e-6)
         np.testing.assert_allclose(one.covariance.correlation_v, other.covariance.correlation_v, atol=0.51e-6)
         (part,), (wanted,) = one.covariance.pose, other.covariance.pose
         assert (part.data_set, part.weight) == (wanted.data_set, wanted.weight)
         np.testing.assert_allclose(part.covariance, wanted.covariance, rtol=0.51e-3)
-        np.testing.assert_allclose(part.centre, wanted.centre, atol=0.51e-6)
-        np.testing.assert_allclose(part.modes, wanted.modes, rtol=0.51e-3)
+        np.testing.assert_allclose(part.centre, wanted.centre, atol=0.51e-4)
+        np.testing.assert_allclose(part.modes, wanted.modes, rtol=0.51e-2)
         assert part.trajectory == wanted.trajectory
         assert one.residuals.points == other.residuals.points
-        assert one.residuals.mean == pytest.approx(other.residuals.mean, rel=1e-5)
+        assert one.residuals.mean == pytest.approx(other.residuals.mean, rel=0.51e-2)
     assert read_provenance(path) == MADE
     assert is_up_to_date(path, MADE.fingerprint)
 
@@ -141,7 +141,7 @@ S = "surfaces", 0
 WHERE = r"a\.json: surfaces\[0\] \(translation-0\): "
 WRONG = [
     (change("format", to="other"), r"is JSON, but not surfaces of bsmap"),
-    (change("version", to=9), r"is of version 9, this bsmap reads 5"),
+    (change("version", to=9), r"is of version 9, this bsmap reads 6"),
     (change("surfaces", to=None), r"file: surfaces is missing"),
     (change("notes", to=[]), r"file: notes is \[\], wanted an object"),
     (change(*S, to="x"), r"surfaces\[0\]: is 'x', wanted an object"),
@@ -149,14 +149,14 @@ WRONG = [
     (change(*S, "degree_u", to=0), WHERE + "degree_u is 0, wanted 1 or more"),
     (change(*S, "degree_u", to=2.5), WHERE + "degree_u is 2.5, wanted an integer"),
     (change(*S, "degree_v", to=True), WHERE + "degree_v is True, wanted an integer"),
-    (change(*S, "degree_v", to=2), WHERE + r"knots_v: knot 0\.0 is there too often for degree 2"),
-    (change(*S, "knots_u", 4, to=0.999), WHERE + r"knots_u must ascend, but knot 4 is 0\.999 and knot 5"),
-    (change(*S, "knots_u", 0, to=-0.1), WHERE + "knots_u is not clamped: it must begin with 4 zeros and end with 4"),
-    (change(*S, "knots_v", to=[0, 0, 1, 1]), WHERE + "knots_v has 4 knots, wanted 8 or more"),
-    (change(*S, "knots_u", 4, to=0.0), WHERE + r"knots_u: knot 0\.0 is there too often for degree 3"),
-    (change(*S, "knots_u", to=[0] * 4 + [0.5] * 4 + [1] * 4), WHERE + r"knots_u: knot 0\.5 is there too often"),
-    (change(*S, "knots_u", 5, to=None), WHERE + "control_points is 7 x 5 x 3, wanted 6 x 5 x 3"),
-    (change(*S, "knots_u", to="0 0 1 1"), WHERE + "knots_u is '0 0 1 1', wanted numbers"),
+    (change(*S, "degree_v", to=2), WHERE + "control_points is 7 x 5 x 3, wanted 7 x 4 x 3"),
+    (change(*S, "knots_u", 0, to=0.999), WHERE + r"knots_u must ascend, but knot 0 is 0\.999 and knot 1"),
+    (change(*S, "knots_u", 0, to=-0.1), WHERE + r"knots_u: knot -0\.1 lies outside \(0, 1\)"),
+    (change(*S, "knots_u", 0, to=0.0), WHERE + r"knots_u: knot 0\.0 lies outside \(0, 1\)"),
+    (change(*S, "knots_v", to=[]), WHERE + "control_points is 7 x 5 x 3, wanted 7 x 4 x 3"),
+    (change(*S, "knots_u", to=[0.5] * 4), WHERE + r"knots_u: knot 0\.5 is there too often for degree 3"),
+    (change(*S, "knots_u", 1, to=None), WHERE + "control_points is 7 x 5 x 3, wanted 6 x 5 x 3"),
+    (change(*S, "knots_u", to="0.5"), WHERE + r"knots_u is '0\.5', wanted"),
     (change(*S, "control_points", 2, 1, 0, to=math.nan), WHERE + r"control_points\[2\]\[1\]\[0\] is nan, wanted a fi"),
     (change(*S, "control_points", 2, 1, to=[1, 2]), WHERE + "control_points: its rows are of different lengths"),
     (change(*S, "covariance", "blocks", 1, 2, 0, to=-1.0), r"covariance: blocks\[1\]\[2\] is not positive semidefin"),
@@ -167,18 +167,21 @@ WRONG = [
     (change(*S, "covariance", "correlation_u", 0, to=2.0), r"correlation_u has a diagonal that is not 1"),
     (change(*S, "covariance", "correlation_v", 3, to=None), r"covariance: correlation_v is 14, wanted 15"),
     (change("poses", 0, "covariance", 0, to=-1), r"poses\[0\]: covariance is not positive semidefinite"),
-    (change(*S, "covariance", "pose", 0, "weight", to="1"), r"pose\[0\]: weight is '1', wanted numbers"),
-    (change(*S, "covariance", "pose", 0, "data_set", to="x"), r"pose\[0\]: there is no pose of a data set 'x'"),
+    (change(*S, "covariance", "weights", 0, to="1"), r"covariance: weights holds '1', wanted whole numbers or null"),
+    (change(*S, "covariance", "weights", to=[1, 2]), r"weights is 2, wanted 1, as many as data_sets"),
+    (change("poses", 1, to=None), r"covariance: weights: there is no pose of data set 'translation-0'"),
     (change("poses", 1, "modes", to=[[0.0, 0.0, 0.0]]), r"poses\[1\]: has 1 modes, others of its trajectory 2"),
     (change(*S, "covariance", to=None), WHERE + "covariance is missing"),
-    (change(*S, "residuals", "rms", to=math.inf), WHERE + "residuals: rms is inf, wanted a finite number"),
-    (change(*S, "residuals", "points", to=-1), WHERE + "residuals: points is -1, wanted 0 or more"),
+    (change(*S, "residuals", 2, to=math.inf), WHERE + r"residuals\[2\] is inf, wanted a finite number"),
+    (change(*S, "residuals", 0, to=-1), WHERE + r"residuals\[0\] is -1, wanted a whole number, 0 or more"),
     (change(*S, "data_sets", to=[1]), WHERE + r"data_sets is \[1\], wanted a list of strings"),
     (change("data_sets", 0, "movement", to="fly"), r"data_sets\[0\] \(translation-0\): movement is 'fly', wanted tr"),
     (
         change("decisions", 0, "outcome", to="maybe"),
         r"decisions\[0\]: outcome is 'maybe', wanted merged, refused, moved",
     ),
+    (change("decisions", 0, "pairs", 0, to=["a", "b"]), r"decisions\[0\]: pairs\[0\] is .* wanted two names and 1 fig"),
+    (change("decisions", 0, "pairs", 0, 0, to=3), r"decisions\[0\]: pairs\[0\] begins with \[3, .* wanted two names"),
 ]
 
 

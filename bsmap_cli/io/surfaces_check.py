@@ -1,11 +1,14 @@
 """Checked way from the JSON of surfaces_json.py to the model: what is wrong is told by surface, field and value."""
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from bsmap_cli.core.bspline import clamped_knots
+from bsmap_cli.io.whole_numbers import CURVES, DIRECTIONS, POINTS, ROOTS, WEIGHTS, from_whole, trim_units
 from bsmap_cli.model import (
     Array,
     BSplineSurface,
@@ -27,8 +30,8 @@ BLOCK_TOLERANCE = 1e-3
 CORRELATION_TOLERANCE = 1e-4
 HEIGHT_TOLERANCE = 1e-6
 OUTCOMES = ("merged", "refused", "moved")
-ROOT_UNIT = 1e-8
-"""Metres of which roots of heights' covariances are whole multiples."""
+LENGTH_TOLERANCE = 1e-4
+"""Of directions, which are of length 1."""
 MOVEMENTS = ("translation", "rotation", "unorganised")
 
 
@@ -38,7 +41,7 @@ class MalformedError(ValueError):
 
 def parse_map(plain: dict[str, Any]) -> SurfaceMap:
     """Surfaces of a file's JSON object; MalformedError where it does not make sense."""
-    corners = _points(plain, "corners", "file")
+    corners = from_whole(_points(plain, "corners", "file"), CURVES, (0,))
     poses = _poses(_get(plain, "poses", list, "file"))
     creases = tuple(_crease(c, corners, f"creases[{i}]") for i, c in enumerate(_get(plain, "creases", list, "file")))
     surfaces = tuple(
@@ -53,7 +56,11 @@ def parse_map(plain: dict[str, Any]) -> SurfaceMap:
     return SurfaceMap(
         surfaces=surfaces,
         data_sets=tuple(_data_set(d, f"data_sets[{i}]") for i, d in enumerate(_get(plain, "data_sets", list, "file"))),
-        decisions=tuple(_decision(d, f"decisions[{i}]") for i, d in enumerate(_get(plain, "decisions", list, "file"))),
+        decisions=tuple(
+            decision
+            for i, run in enumerate(_get(plain, "decisions", list, "file"))
+            for decision in _decisions(run, f"decisions[{i}]")
+        ),
         notes=_get(plain, "notes", dict, "file"),
         creases=creases,
         corners=corners,
@@ -69,7 +76,8 @@ def _crease(plain: Any, corners: Array, where: str) -> Crease:
         raise MalformedError(f"{where}: surfaces has {len(names)} names, wanted 2")
     first, last = _numbers(plain, "corners", 2, len(corners), "corner", where).tolist()
     ends = [corners[k : k + 1] if k >= 0 else np.zeros((0, 3)) for k in (first, last)]
-    points = np.concatenate([ends[0], _points(plain, "points", where), ends[1]])
+    inner = from_whole(_points(plain, "points", where), CURVES, (0,))
+    points = np.concatenate([ends[0], inner, ends[1]])
     if len(points) < 2:
         raise MalformedError(f"{where}: has {len(points)} points with its corners, wanted 2 or more")
     return Crease((names[0], names[1]), points, (first, last))
@@ -86,24 +94,29 @@ def _surface(plain: Any, where: str, creases: int, poses: dict[str, PosePart]) -
     p, q = (_degree(plain, key, where) for key in ("degree_u", "degree_v"))
     knots_u, knots_v = _knots(plain, "knots_u", p, where), _knots(plain, "knots_v", q, where)
     nu, nv = len(knots_u) - p - 1, len(knots_v) - q - 1
+    net = from_whole(_array(plain, "control_points", (nu, nv, 3), where), POINTS, (0, 1))
+    data_sets, steps = _names(plain, "data_sets", where), trim_units(net)
     return BSplineSurface(
         name=name,
-        data_sets=_names(plain, "data_sets", where),
+        data_sets=data_sets,
         degree_u=p,
         degree_v=q,
         knots_u=knots_u,
         knots_v=knots_v,
-        control_points=_array(plain, "control_points", (nu, nv, 3), where),
-        covariance=_covariance(_get(plain, "covariance", dict, where), nu, nv, poses, f"{where}: covariance"),
-        residuals=_residuals(_get(plain, "residuals", dict, where), f"{where}: residuals"),
+        control_points=net,
+        covariance=_covariance(
+            _get(plain, "covariance", dict, where), (nu, nv), data_sets, poses, f"{where}: covariance"
+        ),
+        residuals=_residuals(plain, where),
         trims=tuple(
-            _loop(loop, creases, f"{where}: trims[{i}]") for i, loop in enumerate(_get(plain, "trims", list, where))
+            _loop(loop, steps, creases, f"{where}: trims[{i}]")
+            for i, loop in enumerate(_get(plain, "trims", list, where))
         ),
     )
 
 
-def _loop(plain: Any, creases: int, where: str) -> TrimLoop:
-    parameters = _array(plain, "parameters", (None, 2), where)
+def _loop(plain: Any, steps: Array, creases: int, where: str) -> TrimLoop:
+    parameters = from_whole(_array(plain, "parameters", (None, 2), where), steps, (0,))
     if len(parameters) < 3:
         raise MalformedError(f"{where}: parameters has {len(parameters)} vertices, wanted 3 or more")
     if np.any((parameters < 0.0) | (parameters > 1.0)):
@@ -128,69 +141,73 @@ def _degree(plain: dict[str, Any], key: str, where: str) -> int:
 
 
 def _knots(plain: dict[str, Any], key: str, degree: int, where: str) -> Array:
-    """Clamped knot vector on [0, 1], no inner knot more than `degree` times."""
-    knots = _array(plain, key, (None,), where)
-    if len(knots) < 2 * degree + 2:
-        raise MalformedError(f"{where}: {key} has {len(knots)} knots, wanted {2 * degree + 2} or more")
-    down = np.flatnonzero(np.diff(knots) < 0)
+    """Clamped knot vector on [0, 1] of inner knots, none of them more than `degree` times."""
+    inner = np.zeros(0) if _get(plain, key, list, where) == [] else _array(plain, key, (None,), where)
+    down = np.flatnonzero(np.diff(inner) < 0)
     if len(down):
         k = int(down[0])
-        raise MalformedError(f"{where}: {key} must ascend, but knot {k} is {knots[k]} and knot {k + 1} {knots[k + 1]}")
-    start, inner, end = knots[: degree + 1], knots[degree + 1 : -degree - 1], knots[-degree - 1 :]
-    if np.any(start != 0.0) or np.any(end != 1.0):
-        raise MalformedError(
-            f"{where}: {key} is not clamped: it must begin with {degree + 1} zeros and end with {degree + 1} ones"
-        )
+        raise MalformedError(f"{where}: {key} must ascend, but knot {k} is {inner[k]} and knot {k + 1} {inner[k + 1]}")
     values, counts = np.unique(inner, return_counts=True)
     for value, count in zip(values.tolist(), counts.tolist(), strict=True):
-        if count > degree or value in (0.0, 1.0):
-            raise MalformedError(f"{where}: {key}: knot {value} is there too often for degree {degree}")
-    return knots
+        if count > degree or not 0.0 < value < 1.0:
+            what = "is there too often for degree" if 0.0 < value < 1.0 else "lies outside (0, 1), of degree"
+            raise MalformedError(f"{where}: {key}: knot {value} {what} {degree}")
+    return clamped_knots(degree, inner)
 
 
 def _covariance(
-    plain: dict[str, Any], nu: int, nv: int, poses: dict[str, PosePart], where: str
+    plain: dict[str, Any], size: tuple[int, int], data_sets: Sequence[str], poses: dict[str, PosePart], where: str
 ) -> SurfaceCovariance | HeightCovariance:
+    nu, nv = size
+    pose = _pose(plain, data_sets, poses, where)
     if "directions" in plain:
-        return _heights(plain, nu, nv, poses, where)
+        return _heights(plain, nu, nv, pose, where)
     blocks = _array(plain, "blocks", (nu, nv, 6), where)
     _check_blocks(blocks, where)
     return SurfaceCovariance(
         blocks=blocks,
         correlation_u=_correlation(plain, "correlation_u", nu, where),
         correlation_v=_correlation(plain, "correlation_v", nv, where),
-        pose=_pose(plain, poses, where),
+        pose=pose,
     )
 
 
-def _heights(plain: dict[str, Any], nu: int, nv: int, poses: dict[str, PosePart], where: str) -> HeightCovariance:
-    directions = _array(plain, "directions", (None, None, 3), where)
+def _heights(plain: dict[str, Any], nu: int, nv: int, pose: tuple[PosePart, ...], where: str) -> HeightCovariance:
+    directions = from_whole(_array(plain, "directions", (None, None, 3), where), DIRECTIONS)
     if directions.shape[0] not in (1, nu) or directions.shape[1] not in (1, nv):
         got = " x ".join(map(str, directions.shape))
         raise MalformedError(f"{where}: directions is {got}, wanted {nu} or 1 x {nv} or 1 x 3")
-    if np.any(np.abs(np.linalg.norm(directions, axis=2) - 1.0) > 1e-6):
+    if np.any(np.abs(np.linalg.norm(directions, axis=2) - 1.0) > LENGTH_TOLERANCE):
         raise MalformedError(f"{where}: directions are not of length 1")
     n = nu * nv
     if "root" in plain:
         root = np.zeros((n, n))
-        root.T[np.triu_indices(n)] = _array(plain, "root", (n * (n + 1) // 2,), where) * ROOT_UNIT
-        return HeightCovariance(directions, root @ root.T, _pose(plain, poses, where))
+        root.T[np.triu_indices(n)] = _array(plain, "root", (n * (n + 1) // 2,), where)
+        root *= _get(plain, "scale", int, where) / ROOTS
+        return HeightCovariance(directions, root @ root.T, pose)
     matrix = _symmetric(_array(plain, "matrix", (n * (n + 1) // 2,), where), n)
     eigenvalues = np.linalg.eigvalsh(matrix)
     if eigenvalues[0] < -HEIGHT_TOLERANCE * abs(eigenvalues[-1]):
         raise MalformedError(f"{where}: matrix is not positive semidefinite (eigenvalue {eigenvalues[0]:.3g})")
-    return HeightCovariance(directions, matrix, _pose(plain, poses, where))
+    return HeightCovariance(directions, matrix, pose)
 
 
-def _pose(plain: dict[str, Any], poses: dict[str, PosePart], where: str) -> tuple[PosePart, ...]:
-    """Pose parts of a surface, by the data sets that it names."""
+def _pose(
+    plain: dict[str, Any], data_sets: Sequence[str], poses: dict[str, PosePart], where: str
+) -> tuple[PosePart, ...]:
+    """Pose parts of a surface, by the weights of its data sets."""
+    weights = _get(plain, "weights", list, where)
+    if weights and len(weights) != len(data_sets):
+        raise MalformedError(f"{where}: weights is {len(weights)}, wanted {len(data_sets)}, as many as data_sets")
     parts = []
-    for i, one in enumerate(_get(plain, "pose", list, where)):
-        here = f"{where}: pose[{i}]"
-        name, weight = _get(one, "data_set", str, here), _number(one, "weight", here)
+    for name, weight in zip(data_sets, weights, strict=bool(weights)):
+        if weight is None:
+            continue
+        if isinstance(weight, bool) or not isinstance(weight, int):
+            raise MalformedError(f"{where}: weights holds {_short(weight)}, wanted whole numbers or null")
         if name not in poses:
-            raise MalformedError(f"{here}: there is no pose of a data set {name!r}")
-        parts.append(replace(poses[name], weight=weight))
+            raise MalformedError(f"{where}: weights: there is no pose of data set {name!r}")
+        parts.append(replace(poses[name], weight=weight / WEIGHTS))
     return tuple(parts)
 
 
@@ -255,10 +272,10 @@ def _modes(plain: dict[str, Any], where: str) -> Array | None:
 
 
 def _residuals(plain: dict[str, Any], where: str) -> Residuals:
-    return Residuals(
-        points=_count(plain, "points", where),
-        **{name: _number(plain, name, where) for name in ("mean", "rms", "percentile_95", "maximum")},
-    )
+    points, *others = _array(plain, "residuals", (5,), where).tolist()
+    if points < 0 or points != int(points):
+        raise MalformedError(f"{where}: residuals[0] is {points:g}, wanted a whole number, 0 or more")
+    return Residuals(int(points), *others)
 
 
 def _data_set(plain: Any, where: str) -> DataSet:
@@ -268,12 +285,18 @@ def _data_set(plain: Any, where: str) -> DataSet:
     return DataSet(name, movement, *(_count(plain, key, where) for key in ("first_scan", "last_scan", "points")))
 
 
-def _decision(plain: Any, where: str) -> Decision:
-    outcome = _get(plain, "outcome", str, where)
+def _decisions(plain: Any, where: str) -> list[Decision]:
+    outcome, reason = _get(plain, "outcome", str, where), _get(plain, "reason", str, where)
     if outcome not in OUTCOMES:
         raise MalformedError(f"{where}: outcome is {outcome!r}, wanted {', '.join(OUTCOMES)}")
-    first, second, reason = (_get(plain, key, str, where) for key in ("first", "second", "reason"))
-    return Decision(first, second, outcome, reason, _get(plain, "figures", dict, where))
+    figures, found = _names(plain, "figures", where), []
+    for i, pair in enumerate(_get(plain, "pairs", list, where)):
+        if not isinstance(pair, list) or len(pair) != 2 + len(figures):
+            raise MalformedError(f"{where}: pairs[{i}] is {_short(pair)}, wanted two names and {len(figures)} figures")
+        if not all(isinstance(name, str) for name in pair[:2]):
+            raise MalformedError(f"{where}: pairs[{i}] begins with {_short(pair[:2])}, wanted two names")
+        found.append(Decision(pair[0], pair[1], outcome, reason, dict(zip(figures, pair[2:], strict=True))))
+    return found
 
 
 def _placement(plain: Any, where: str) -> Placement:

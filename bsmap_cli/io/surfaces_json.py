@@ -1,14 +1,16 @@
 """The artifact of `fit` and `merge`: B-spline surfaces as JSON (.surfaces.json, .map.json; .gz by name).
 
-    {"format": "bsmap-surfaces", "version": 5, "units": "metres, radians, frame map",
+    {"format": "bsmap-surfaces", "version": 6, "units": "metres, radians, frame map",
      "bsmap-provenance": {...},
      "data_sets": [{"name", "movement": "translation" | "rotation", "first_scan", "last_scan", "points"}, ...],
      "poses": [{"data_set", "centre": [x, y], "covariance": [xx, xy, xt, yy, yt, tt],
                 "trajectory": name, "modes": k x 3, or null where it is not known what poses have in common}, ...],
      "surfaces": [surface, ...],
-     "decisions": [{"first", "second", "outcome": "merged" | "refused" | "moved", "reason", "figures": {...}}, ...],
-     "corners": k x 3 points in which creases end together,
-     "creases": [{"surfaces": [name, name], "corners": [first, last], "points": k x 3 polyline}, ...],
+     "decisions": [{"outcome": "merged" | "refused" | "moved", "reason", "figures": [names],
+                    "pairs": [[first, second, value of each figure, ...], ...]}, ...],
+     "corners": k x 3 points in which creases end together, units of 0.1 mm, D
+     "creases": [{"surfaces": [name, name], "corners": [first, last],
+                  "points": k x 3 polyline, units of 0.1 mm, D}, ...],
                              corners: their numbers, -1 for a free end; corners are not among the points
      "placements": [{"survey", "pose": [x, y, turn], "height", "covariance": [xx, xy, xt, yy, yt, tt],
                      "matched", "denied", "rival", "rival_pose": [x, y, turn] or null, "verdict": "unique"}, ...],
@@ -17,26 +19,27 @@
 
     surface = {"name", "data_sets": [names],
      "degree_u", "degree_v",
-     "knots_u", "knots_v":     full clamped knot vectors on [0, 1]: nu + degree_u + 1 and nv + degree_v + 1 numbers
-     "control_points":         nu x nv x 3
+     "knots_u", "knots_v":     inner knots of clamped knot vectors on [0, 1]: nu - degree_u - 1 and nv - degree_v - 1
+     "control_points":         nu x nv x 3, units of 0.01 mm, D along v and then along u
      "covariance": {
         "blocks":              nu x nv x 6: xx, xy, xz, yy, yz, zz of the control points' sensor part
         "correlation_u", "correlation_v":   upper triangles row by row, nu (nu + 1) / 2 and nv (nv + 1) / 2 numbers
         or, of control points that move along given directions only,
-        "directions":          nu or 1 x nv or 1 x 3 unit vectors
-        "root":                lower triangle L column by column, n (n + 1) / 2 integers, n = nu nv: the heights'
-                               covariance is L L', in units of 1e-8 m; or, of one that is nearly singular,
+        "directions":          nu or 1 x nv or 1 x 3 unit vectors, units of 1e-5
+        "scale", "root":       lower triangle L column by column, n (n + 1) / 2 numbers, n = nu nv: the heights'
+                               covariance is L L', in units of scale times 1e-8 m; or, of one that is nearly singular,
         "matrix":              its upper triangle row by row, in square metres
-        and "pose": [{"data_set", "weight"}, ...]},
-     "trims": [{"parameters": k x 2, u and v of a closed polygon,
+        and "weights":         of the poses of the data sets, units of 1e-4; null for one without, [] where none has}
+     "trims": [{"parameters": k x 2, u and v of a closed polygon, D, in steps of which 1 has ceil(2000 l): l is the
+                              longest way in metres along the control points of one v, or of one u,
                 "creases": k numbers of the creases along the sides from each vertex to the next, -1 for none}, ...]
                              no trims: the whole surface; else what the loops together wind around counter-clockwise
-     "residuals": {"points", "mean", "rms", "percentile_95", "maximum"}}
+     "residuals": [points, mean, rms, percentile_95, maximum]}
 
-model/surfaces.py tells what each is. Numbers are rounded to what they are worth, for the bytes of a map matter:
-coordinates, correlations and weights to 1e-6, directions to 1e-7, knots to 1e-10, creases, corners and parameters of
-trims to 1e-5, covariances to 4 (those of heights that are nearly singular to
-7) and residuals to 6 significant digits. A map that was read is written again byte for byte.
+model/surfaces.py tells what each is. What has units is in whole numbers of them; D: the first one, and of each other
+the difference to the one before. Others are rounded to what they are worth: correlations to 1e-6, knots to 1e-10,
+places of poses to 1e-4, covariances to 4 (those of heights that are nearly singular to 7), modes and residuals to 3
+significant digits. A map that was read is written again byte for byte.
 """
 
 import gzip
@@ -49,10 +52,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bsmap_cli.core.gaussian import rounded_root
+from bsmap_cli.core.bspline import inner_knots
 from bsmap_cli.errors import BadInputError, MissingInputError
 from bsmap_cli.io.artifact import Provenance, atomic_output, plain_json
-from bsmap_cli.io.surfaces_check import ROOT_UNIT, MalformedError, parse_map
+from bsmap_cli.io.surfaces_check import MalformedError, parse_map
+from bsmap_cli.io.whole_numbers import (
+    CURVES,
+    DIRECTIONS,
+    POINTS,
+    WEIGHTS,
+    from_whole,
+    runs_of,
+    scaled_root,
+    trim_units,
+    whole,
+)
 from bsmap_cli.model import (
     Array,
     BSplineSurface,
@@ -66,9 +80,7 @@ from bsmap_cli.model import (
 )
 
 FORMAT = "bsmap-surfaces"
-VERSION = 5
-LEAST_ROOT = 200.0
-"""Units that the diagonal of a root has at least, so that rounding changes no variance by a percent."""
+VERSION = 6
 
 
 def write_surfaces(path: Path | str, surfaces: SurfaceMap, provenance: Provenance | None = None) -> None:
@@ -89,8 +101,8 @@ def write_surfaces(path: Path | str, surfaces: SurfaceMap, provenance: Provenanc
         _list("data_sets", [plain_json(asdict(data_set)) for data_set in surfaces.data_sets]),
         _list("poses", [_pose_part(part) for part in _poses(surfaces)]),
         _list("surfaces", [_surface(surface) for surface in surfaces.surfaces]),
-        _list("decisions", [plain_json(asdict(decision)) for decision in surfaces.decisions]),
-        _list("corners", _rounded(surfaces.corners, 5)),
+        _list("decisions", [plain_json(run) for run in runs_of(surfaces.decisions)]),
+        _list("corners", whole(surfaces.corners, CURVES, (0,))),
         _list("creases", [_crease(crease) for crease in surfaces.creases]),
         _list("placements", [_placement(placement) for placement in surfaces.placements]),
         f'"notes":{_dumps(plain_json(surfaces.notes))}',
@@ -110,24 +122,28 @@ def _list(key: str, values: list[Any]) -> str:
 
 
 def _surface(surface: BSplineSurface) -> dict[str, Any]:
-    residuals = surface.residuals
+    net = whole(surface.control_points, POINTS, (0, 1))
+    steps = trim_units(from_whole(np.array(net), POINTS, (0, 1)))
+    inner_u, inner_v = (
+        inner_knots(knots, degree)
+        for knots, degree in ((surface.knots_u, surface.degree_u), (surface.knots_v, surface.degree_v))
+    )
     return {
         "name": surface.name,
         "data_sets": list(surface.data_sets),
         "degree_u": int(surface.degree_u),
         "degree_v": int(surface.degree_v),
-        "knots_u": _rounded(surface.knots_u, 10),
-        "knots_v": _rounded(surface.knots_v, 10),
-        "control_points": _rounded(surface.control_points, 6),
-        "covariance": _covariance(surface.covariance),
-        "residuals": {"points": int(residuals.points)}
-        | {name: _significant(value, 6) for name, value in asdict(residuals).items() if name != "points"},
-        "trims": [_loop(loop) for loop in surface.trims],
+        "knots_u": _rounded(inner_u, 10),
+        "knots_v": _rounded(inner_v, 10),
+        "control_points": net,
+        "covariance": _covariance(surface.covariance) | {"weights": _weights(surface)},
+        "residuals": [int(surface.residuals.points), *_significant(list(vars(surface.residuals).values())[1:], 3)],
+        "trims": [_loop(loop, steps) for loop in surface.trims],
     }
 
 
-def _loop(loop: TrimLoop) -> dict[str, Any]:
-    return {"parameters": _rounded(loop.parameters, 5), "creases": np.asarray(loop.creases).tolist()}
+def _loop(loop: TrimLoop, steps: Array) -> dict[str, Any]:
+    return {"parameters": whole(loop.parameters, steps, (0,)), "creases": np.asarray(loop.creases).tolist()}
 
 
 def _crease(crease: Crease) -> dict[str, Any]:
@@ -136,35 +152,34 @@ def _crease(crease: Crease) -> dict[str, Any]:
     return {
         "surfaces": list(crease.surfaces),
         "corners": [int(corner) for corner in crease.corners],
-        "points": _rounded(points, 5),
+        "points": whole(points, CURVES, (0,)),
     }
 
 
 def _covariance(covariance: SurfaceCovariance | HeightCovariance) -> dict[str, Any]:
     if isinstance(covariance, HeightCovariance):
-        return {
-            "directions": _rounded(covariance.directions, 7),
-            **_heights(covariance.matrix),
-            "pose": _shares(covariance),
-        }
+        return {"directions": whole(covariance.directions, DIRECTIONS), **_heights(covariance.matrix)}
     return {
         "blocks": _significant(covariance.blocks, 4),
         "correlation_u": _rounded(_upper(covariance.correlation_u), 6),
         "correlation_v": _rounded(_upper(covariance.correlation_v), 6),
-        "pose": _shares(covariance),
     }
 
 
 def _heights(matrix: Array) -> dict[str, Any]:
     """Covariance of heights by its root, which needs fewer digits: what is small is no difference of what is large."""
-    root = rounded_root(matrix, ROOT_UNIT, LEAST_ROOT)
-    if root is None:
+    found = scaled_root(matrix)
+    if found is None:
         return {"matrix": _significant(_upper(matrix), 7)}
-    return {"root": _upper(root.T).astype(int).tolist()}
+    return {"scale": found[0], "root": _upper(found[1].T).astype(int).tolist()}
 
 
-def _shares(covariance: SurfaceCovariance | HeightCovariance) -> list[dict[str, Any]]:
-    return [{"data_set": part.data_set, "weight": _rounded(part.weight, 6)} for part in covariance.pose]
+def _weights(surface: BSplineSurface) -> list[int | None]:
+    """Of the data sets' poses, in the order of the surface's data sets; ValueError where a pose is of another one."""
+    weights = {part.data_set: whole(part.weight, WEIGHTS) for part in surface.covariance.pose}
+    if unknown := sorted(weights.keys() - set(surface.data_sets)):
+        raise ValueError(f"surface {surface.name}: has the pose of {unknown[0]}, which is none of its data sets")
+    return [weights.get(name) for name in surface.data_sets] if weights else []
 
 
 def _poses(surfaces: SurfaceMap) -> list[PosePart]:
@@ -181,10 +196,10 @@ def _poses(surfaces: SurfaceMap) -> list[PosePart]:
 def _pose_part(part: PosePart) -> dict[str, Any]:
     return {
         "data_set": part.data_set,
-        "centre": _rounded(part.centre, 6),
+        "centre": _rounded(part.centre, 4),
         "covariance": _significant(_upper(part.covariance), 4),
         "trajectory": part.trajectory,
-        "modes": None if part.modes is None else _significant(part.modes.T, 4),
+        "modes": None if part.modes is None else _significant(part.modes.T, 3),
     }
 
 

@@ -174,7 +174,7 @@ def _refusal(pair: Pair, gate: float, params: MergeParams) -> str | None:
 def _decision(faces: Sequence[BasedFace], pair: Pair, reason: str | None) -> Decision:
     figures = {"area": pair.area, "offset": pair.offset, "squared_mahalanobis": pair.distance}
     names = faces[pair.first].surface.name, faces[pair.second].surface.name
-    rounded = {key: float(f"{value:.4g}") for key, value in figures.items()}
+    rounded = {key: float(f"{value:.2g}") for key, value in figures.items()}
     if reason is None:
         return Decision(*names, "merged", "the same face", rounded)
     return Decision(*names, MOVED if reason == MOVED_REASON else "refused", reason, rounded)

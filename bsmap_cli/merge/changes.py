@@ -90,4 +90,4 @@ def _decision(some: Sequence[BSplineSurface], walls: Oriented, share: float) -> 
     largest = max(some, key=lambda surface: (surface.residuals.points, surface.name))
     reason = "it moved, came or went: another survey saw the bare floor there, or what lies behind"
     figures = {"area": float(walls.areas.sum()), "share": share}
-    return Decision(largest.name, "", MOVED, reason, {key: float(f"{value:.4g}") for key, value in figures.items()})
+    return Decision(largest.name, "", MOVED, reason, {key: float(f"{value:.2g}") for key, value in figures.items()})

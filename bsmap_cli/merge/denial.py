@@ -99,5 +99,5 @@ def _is_none(face: BasedFace, said: Sequence[_Said], denied: NDArray[np.bool_], 
 
 def _decision(face: BasedFace, denied: NDArray[np.bool_]) -> Decision:
     figures = {"area": face.area, "denied": float(denied[face.areas > 0.0].mean())}
-    rounded = {key: float(f"{value:.4g}") for key, value in figures.items()}
+    rounded = {key: float(f"{value:.2g}") for key, value in figures.items()}
     return Decision(face.surface.name, "", "refused", REASON, rounded)

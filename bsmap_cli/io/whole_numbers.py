@@ -1,0 +1,83 @@
+"""Numbers of an artifact as whole ones, in units of what they are worth: few digits, for the bytes of a map matter.
+
+Where neighbours are alike, each is written as its difference to the one before.
+"""
+
+from collections.abc import Iterable, Sequence
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from bsmap_cli.core.gaussian import rounded_root
+from bsmap_cli.model import Array, Decision
+
+POINTS, CURVES, DIRECTIONS, WEIGHTS = 1e5, 1e4, 1e5, 1e4
+"""Units in a metre, of control points and of creases and corners; in 1, of directions, and of weights of poses."""
+ROOTS = 1e8
+"""Units in a metre of roots of heights' covariances, before they are scaled."""
+TRIMS = 2e3
+"""Units in a metre of the parameters of trims, about: so many to the length of the surface."""
+LEAST_ROOT = 100.0
+"""Units that the diagonal of a root has at least, so that rounding changes no variance by more than a percent."""
+
+
+def whole(values: ArrayLike, units: float | Array, axes: Sequence[int] = ()) -> Any:
+    """Nested lists of whole numbers of units; along axes the first one, and differences.
+
+    Raises
+    ------
+    ValueError
+        A number is not finite.
+    """
+    numbers = np.rint(np.asarray(values, dtype=float) * units)
+    if not np.isfinite(numbers).all():
+        raise ValueError("a number that is not finite is not JSON compliant")
+    for axis in axes:
+        numbers = np.diff(numbers, axis=axis, prepend=np.zeros_like(numbers.take([0] if numbers.size else [], axis)))
+    return numbers.astype(np.int64).tolist()
+
+
+def from_whole(numbers: Array, units: float | Array, axes: Sequence[int] = ()) -> Array:
+    """The values that `whole` gave as numbers."""
+    for axis in axes:
+        numbers = numbers.cumsum(axis=axis)
+    return np.asarray(numbers / units)
+
+
+def trim_units(control_points: Array) -> Array:
+    """(2,) steps into which the parameters of trims along u and v are divided, from control points (nu, nv, 3)."""
+    ways = [np.linalg.norm(np.diff(control_points, axis=axis), axis=2).sum(axis=axis).max() for axis in (0, 1)]
+    return np.maximum(np.ceil(np.array(ways) * TRIMS), 1.0)
+
+
+def scaled_root(covariance: Array) -> tuple[int, Array] | None:
+    """Root (n, n) of a covariance in whole multiples of a power of two of units, and that power; None where it is
+    nearly singular.
+
+    The power is the largest for which the least number on the diagonal is LEAST_ROOT or more.
+    """
+    scale, root = 1, rounded_root(covariance, 1.0 / ROOTS, LEAST_ROOT)
+    found = None if root is None else (scale, root)
+    while found is not None and np.diag(found[1]).min() >= 2.0 * LEAST_ROOT:
+        scale *= 2
+        coarser = rounded_root(covariance, scale / ROOTS, LEAST_ROOT)
+        if coarser is None:
+            break
+        found = scale, coarser
+    return found
+
+
+def runs_of(decisions: Iterable[Decision]) -> list[dict[str, Any]]:
+    """Decisions that follow each other with the same outcome, reason and names of figures, put together."""
+    runs = groupby(decisions, key=lambda d: (d.outcome, d.reason, tuple(d.figures)))
+    return [
+        {
+            "outcome": outcome,
+            "reason": reason,
+            "figures": list(names),
+            "pairs": [[d.first, d.second, *d.figures.values()] for d in some],
+        }
+        for (outcome, reason, names), some in runs
+    ]

@@ -6,8 +6,11 @@ from face_maps import floor, map_of, plate
 
 from bsmap_cli.merge import merge_surfaces
 from bsmap_cli.merge.bases import based_face, field_of
-from bsmap_cli.merge.rings import Ring
+from bsmap_cli.merge.curves import Curve
+from bsmap_cli.merge.rings import Knots, Loop, Ring, put_together
+from bsmap_cli.merge.runs import Meeting, Run
 from bsmap_cli.merge.topology import Edge, Topology, without_twice
+from bsmap_cli.merge.tracing import EVERYWHERE
 from bsmap_cli.merge.untangling import untangled
 from bsmap_cli.model import Crease
 from bsmap_cli.params import MergeParams
@@ -84,3 +87,18 @@ def test_edge_along_which_one_face_runs_twice_is_none():
     assert len(found.edges) == 1
     assert [ring.edges.tolist() for ring in found.rings[0]] == [[0, -1, -1, -1, -1], [-1, -1, -1]]
     assert found.rings[1][0].edges.tolist() == [0, -1, -1, -1, -1]
+
+
+def test_loop_whose_runs_all_end_in_one_corner_stays_as_it_was():
+    points = np.array([[0.0, 0, 0], [0.02, 0, 0], [0.0, 0.02, 0]])
+    ways = np.eye(3)[:2]
+    curves = [
+        Curve((0, k + 1), np.stack([0.0 * way, way]), np.array([0.0, 1.0]), EVERYWHERE) for k, way in enumerate(ways)
+    ]
+    knots = [Knots(np.zeros(1), np.zeros(1, dtype=int), np.zeros((1, 3)))] * 2
+    runs = [Run(0, 0, 1, 0.0, 0.02), Run(1, 2, 0, 0.02, 0.0)]
+    meetings = [Meeting(k, 1 - k, (0, 1, 2), np.zeros(3)) for k in (0, 1)]
+    loop = Loop(0, points, runs, meetings, np.zeros((2, 2), dtype=int))
+    found = put_together(loop, curves, knots, {})
+    np.testing.assert_array_equal(found.points, points)
+    assert found.edges.tolist() == [-1, -1, -1]

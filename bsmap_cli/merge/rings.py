@@ -64,7 +64,7 @@ def _put_together(
     loop: Loop, curves: Sequence[Curve], knots: Sequence[Knots], number_of: Mapping[tuple[int, int], int]
 ) -> Ring:
     met = {meeting.run for meeting in loop.meetings}
-    points, numbers = [], []
+    points, numbers = [np.zeros((0, 3))], list[int]()
     for k, run in enumerate(loop.runs):
         own = knots[run.curve]
         start, end = knots_of_run(loop, k, own)
@@ -79,7 +79,7 @@ def _put_together(
             way = _open_way(loop, k, curves, knots)
             points.append(np.concatenate([own.points[end : end + 1], way]))
             numbers += [-1] * (len(way) + 1)
-    return _without_doubles(np.concatenate(points).reshape(-1, 3), np.array(numbers))
+    return _without_doubles(np.concatenate(points), np.array(numbers, dtype=np.int64))
 
 
 def _open_way(loop: Loop, k: int, curves: Sequence[Curve], knots: Sequence[Knots]) -> Array:

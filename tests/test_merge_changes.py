@@ -47,6 +47,23 @@ def test_panel_that_slid_along_its_wall_is_told():
     assert {d.first for d in moved(result)} == {"set-01/panel", "set-02/panel"}
 
 
+def leaf(data_set, angle):
+    """Door leaf, 0.9 m wide, its hinge 6 cm before the wall y = 4, turned out of the wall by an angle."""
+    along = 0.9 * np.array([np.cos(angle), -np.sin(angle), 0.0])
+    return plate(f"{data_set}/leaf", (2.0, 3.94, 0.05), tuple(along), (0.0, 0.0, 1.9), (3.0, 2.0))
+
+
+@pytest.mark.parametrize("degrees", [4.0, 15.0, 90.0])
+def test_door_leaf_that_was_turned_is_told_and_not_averaged(degrees):
+    leaves = leaf("set-01", 0.0), leaf("set-02", np.radians(degrees))
+    maps = [with_pieces(one.data_sets[0], one) for one in leaves]
+    result = merge_surfaces(maps, MergeParams())
+    assert {name for d in moved(result) for name in (d.first, d.second) if name} == {one.name for one in leaves}
+    kept = {s.name: s for s in result.surfaces}
+    for one in leaves:
+        np.testing.assert_allclose(kept[one.name].control_points, one.control_points, atol=1e-4)
+
+
 def test_what_nobody_else_looked_at_is_not_told():
     """A second room that one survey saw, a cupboard in a corner where the other one saw no floor, and one high up."""
     second = boxed("set-01", (6.2, 0.0, 0.0), (9.0, 4.0, 2.5)).surfaces

@@ -122,7 +122,7 @@ UPWARDS = {"directions": [[[0, 0, 100_000]]], "weights": []}
         ([[0, 0]], ("corners",), r"corners is 1 x 2, wanted any x 3"),
         ([[0, 0], [1, 0]], (*FIRST, "trims", 0, "parameters"), "has 2 vertices, wanted 3 or more"),
         ([[0, 0], [4000, 0], [0, 4000], [-4000, 1]], (*FIRST, "trims", 0, "parameters"), r"lie outside \[0, 1\]"),
-        ([0, 0, 1, 0], (*FIRST, "trims", 0, "creases"), r"creases\[2\] is 1, wanted -1 or a number of a crease"),
+        ([0, 0, 2, 0], (*FIRST, "trims", 0, "creases"), r"creases\[2\] is 2, wanted 0 or a number of a crease"),
         ([0, 0, 0], (*FIRST, "trims", 0, "creases"), "creases is 3, wanted 4"),
         ([[[0, 0, 200_000]]], (*FIRST, "covariance", "directions"), "directions are not of length 1"),
         (

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bsmap_cli.io.whole_numbers import LEAST_ROOT, ROOTS, from_whole, runs_of, scaled_root, trim_units, whole
+from bsmap_cli.io.whole_numbers import LEAST_ROOT, ROOTS, from_whole, runs_of, scaled_root, whole
 from bsmap_cli.model import Decision
 
 
@@ -24,15 +24,6 @@ def test_differences_are_those_to_the_one_before():
 def test_number_that_is_not_finite_is_refused():
     with pytest.raises(ValueError, match="not finite"):
         whole([np.nan], 1.0)
-
-
-def test_trims_have_two_steps_a_millimetre_and_reach_one():
-    net = np.zeros((2, 2, 3))
-    net[1, :, 0], net[:, 1, 1] = 3.0, 0.7
-    steps = trim_units(net)
-    assert steps.tolist() == [6000.0, 1400.0]
-    assert from_whole(np.array(whole([[1.0, 1.0]], steps)), steps).tolist() == [[1.0, 1.0]]
-    assert trim_units(np.zeros((2, 2, 3))).tolist() == [1.0, 1.0]
 
 
 @pytest.mark.parametrize("size", [1e-5, 3e-5, 1e-4, 2e-3])

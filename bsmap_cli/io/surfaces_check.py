@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from bsmap_cli.core.bspline import clamped_knots
-from bsmap_cli.io.whole_numbers import CURVES, DIRECTIONS, POINTS, ROOTS, WEIGHTS, from_whole, trim_units
+from bsmap_cli.io.trim_loops import Sheet, sheet_of, unpack_loop
+from bsmap_cli.io.whole_numbers import CURVES, DIRECTIONS, POINTS, ROOTS, WEIGHTS, from_whole
 from bsmap_cli.model import (
     Array,
     BSplineSurface,
@@ -44,8 +45,9 @@ def parse_map(plain: dict[str, Any]) -> SurfaceMap:
     corners = from_whole(_points(plain, "corners", "file"), CURVES, (0,))
     poses = _poses(_get(plain, "poses", list, "file"))
     creases = tuple(_crease(c, corners, f"creases[{i}]") for i, c in enumerate(_get(plain, "creases", list, "file")))
+    lines = [crease.points for crease in creases]
     surfaces = tuple(
-        _surface(s, f"surfaces[{i}]", len(creases), poses) for i, s in enumerate(_get(plain, "surfaces", list, "file"))
+        _surface(s, f"surfaces[{i}]", lines, poses) for i, s in enumerate(_get(plain, "surfaces", list, "file"))
     )
     counts = Counter(surface.name for surface in surfaces)
     if twice := sorted(name for name, count in counts.items() if count > 1):
@@ -88,14 +90,14 @@ def _points(plain: Any, key: str, where: str) -> Array:
     return np.zeros((0, 3)) if _get(plain, key, list, where) == [] else _array(plain, key, (None, 3), where)
 
 
-def _surface(plain: Any, where: str, creases: int, poses: dict[str, PosePart]) -> BSplineSurface:
+def _surface(plain: Any, where: str, lines: Sequence[Array], poses: dict[str, PosePart]) -> BSplineSurface:
     name = _get(plain, "name", str, where)
     where = f"{where} ({name})"
     p, q = (_degree(plain, key, where) for key in ("degree_u", "degree_v"))
     knots_u, knots_v = _knots(plain, "knots_u", p, where), _knots(plain, "knots_v", q, where)
     nu, nv = len(knots_u) - p - 1, len(knots_v) - q - 1
     net = from_whole(_array(plain, "control_points", (nu, nv, 3), where), POINTS, (0, 1))
-    data_sets, steps = _names(plain, "data_sets", where), trim_units(net)
+    data_sets, sheet = _names(plain, "data_sets", where), sheet_of(net)
     return BSplineSurface(
         name=name,
         data_sets=data_sets,
@@ -109,19 +111,24 @@ def _surface(plain: Any, where: str, creases: int, poses: dict[str, PosePart]) -
         ),
         residuals=_residuals(plain, where),
         trims=tuple(
-            _loop(loop, steps, creases, f"{where}: trims[{i}]")
+            _loop(loop, sheet, lines, f"{where}: trims[{i}]")
             for i, loop in enumerate(_get(plain, "trims", list, where))
         ),
     )
 
 
-def _loop(plain: Any, steps: Array, creases: int, where: str) -> TrimLoop:
-    parameters = from_whole(_array(plain, "parameters", (None, 2), where), steps, (0,))
-    if len(parameters) < 3:
-        raise MalformedError(f"{where}: parameters has {len(parameters)} vertices, wanted 3 or more")
-    if np.any((parameters < 0.0) | (parameters > 1.0)):
+def _loop(plain: Any, sheet: Sheet, lines: Sequence[Array], where: str) -> TrimLoop:
+    numbers = _array(plain, "parameters", (None, 2), where)
+    if len(numbers) < 3:
+        raise MalformedError(f"{where}: parameters has {len(numbers)} vertices, wanted 3 or more")
+    creases = _array(plain, "creases", (len(numbers),), where)
+    bad = np.flatnonzero((creases != np.rint(creases)) | (np.abs(creases) > len(lines)))
+    if len(bad):
+        raise MalformedError(f"{where}: creases[{bad[0]}] is {creases[bad[0]]:g}, wanted 0 or a number of a crease")
+    loop = unpack_loop(numbers, creases.astype(np.int64), sheet, lines)
+    if np.any((loop.parameters < 0.0) | (loop.parameters > 1.0)):
         raise MalformedError(f"{where}: parameters lie outside [0, 1]")
-    return TrimLoop(parameters, _numbers(plain, "creases", len(parameters), creases, "crease", where))
+    return loop
 
 
 def _numbers(plain: Any, key: str, count: int, limit: int, what: str, where: str) -> IntArray:

@@ -30,9 +30,11 @@
                                covariance is L L', in units of scale times 1e-8 m; or, of one that is nearly singular,
         "matrix":              its upper triangle row by row, in square metres
         and "weights":         of the poses of the data sets, units of 1e-4; null for one without, [] where none has}
-     "trims": [{"parameters": k x 2, u and v of a closed polygon, D, in steps of which 1 has ceil(2000 l): l is the
-                              longest way in metres along the control points of one v, or of one u,
-                "creases": k numbers of the creases along the sides from each vertex to the next, -1 for none}, ...]
+     "trims": [{"parameters": k x 2, u and v of a closed polygon, in steps of which 1 has ceil(2000 l): l is the longest
+                              way in metres along the control points of one v, or of one u; trim_loops.py tells from
+                              where each vertex is counted,
+                "creases": k numbers of the creases along the sides from each vertex to the next: 0 for none, 1 for the
+                              first, -1 where the loop runs along it backwards}, ...]
                              no trims: the whole surface; else what the loops together wind around counter-clockwise
      "residuals": [points, mean, rms, percentile_95, maximum]}
 
@@ -45,6 +47,7 @@ significant digits. A map that was read is written again byte for byte.
 import gzip
 import json
 import zlib
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -56,6 +59,7 @@ from bsmap_cli.core.bspline import inner_knots
 from bsmap_cli.errors import BadInputError, MissingInputError
 from bsmap_cli.io.artifact import Provenance, atomic_output, plain_json
 from bsmap_cli.io.surfaces_check import MalformedError, parse_map
+from bsmap_cli.io.trim_loops import Sheet, pack_loop, sheet_of
 from bsmap_cli.io.whole_numbers import (
     CURVES,
     DIRECTIONS,
@@ -64,7 +68,6 @@ from bsmap_cli.io.whole_numbers import (
     from_whole,
     runs_of,
     scaled_root,
-    trim_units,
     whole,
 )
 from bsmap_cli.model import (
@@ -96,11 +99,12 @@ def write_surfaces(path: Path | str, surfaces: SurfaceMap, provenance: Provenanc
     head = {"format": FORMAT, "version": VERSION, "units": "metres, radians, frame map"}
     if provenance is not None:
         head |= {"bsmap-provenance": provenance.to_dict()}
+    lines = [_stored_line(crease) for crease in surfaces.creases]
     parts = [
         _dumps(head)[1:-1],
         _list("data_sets", [plain_json(asdict(data_set)) for data_set in surfaces.data_sets]),
         _list("poses", [_pose_part(part) for part in _poses(surfaces)]),
-        _list("surfaces", [_surface(surface) for surface in surfaces.surfaces]),
+        _list("surfaces", [_surface(surface, lines) for surface in surfaces.surfaces]),
         _list("decisions", [plain_json(run) for run in runs_of(surfaces.decisions)]),
         _list("corners", whole(surfaces.corners, CURVES, (0,))),
         _list("creases", [_crease(crease) for crease in surfaces.creases]),
@@ -121,9 +125,14 @@ def _list(key: str, values: list[Any]) -> str:
     return f'"{key}":[\n' + ",\n".join(map(_dumps, values)) + "]"
 
 
-def _surface(surface: BSplineSurface) -> dict[str, Any]:
+def _stored_line(crease: Crease) -> Array:
+    """Points (k, 3) of a crease as the file has them."""
+    return from_whole(np.array(whole(crease.points, CURVES)), CURVES)
+
+
+def _surface(surface: BSplineSurface, lines: Sequence[Array]) -> dict[str, Any]:
     net = whole(surface.control_points, POINTS, (0, 1))
-    steps = trim_units(from_whole(np.array(net), POINTS, (0, 1)))
+    sheet = sheet_of(from_whole(np.array(net), POINTS, (0, 1)))
     inner_u, inner_v = (
         inner_knots(knots, degree)
         for knots, degree in ((surface.knots_u, surface.degree_u), (surface.knots_v, surface.degree_v))
@@ -138,12 +147,13 @@ def _surface(surface: BSplineSurface) -> dict[str, Any]:
         "control_points": net,
         "covariance": _covariance(surface.covariance) | {"weights": _weights(surface)},
         "residuals": [int(surface.residuals.points), *_significant(list(vars(surface.residuals).values())[1:], 3)],
-        "trims": [_loop(loop, steps) for loop in surface.trims],
+        "trims": [_loop(loop, sheet, lines) for loop in surface.trims],
     }
 
 
-def _loop(loop: TrimLoop, steps: Array) -> dict[str, Any]:
-    return {"parameters": whole(loop.parameters, steps, (0,)), "creases": np.asarray(loop.creases).tolist()}
+def _loop(loop: TrimLoop, sheet: Sheet, lines: Sequence[Array]) -> dict[str, Any]:
+    numbers, creases = pack_loop(loop, sheet, lines)
+    return {"parameters": numbers.tolist(), "creases": creases.tolist()}
 
 
 def _crease(crease: Crease) -> dict[str, Any]:

@@ -17,8 +17,6 @@ POINTS, CURVES, DIRECTIONS, WEIGHTS = 1e5, 1e4, 1e5, 1e4
 """Units in a metre, of control points and of creases and corners; in 1, of directions, and of weights of poses."""
 ROOTS = 1e8
 """Units in a metre of roots of heights' covariances, before they are scaled."""
-TRIMS = 2e3
-"""Units in a metre of the parameters of trims, about: so many to the length of the surface."""
 LEAST_ROOT = 100.0
 """Units that the diagonal of a root has at least, so that rounding changes no variance by more than a percent."""
 
@@ -44,12 +42,6 @@ def from_whole(numbers: Array, units: float | Array, axes: Sequence[int] = ()) -
     for axis in axes:
         numbers = numbers.cumsum(axis=axis)
     return np.asarray(numbers / units)
-
-
-def trim_units(control_points: Array) -> Array:
-    """(2,) steps into which the parameters of trims along u and v are divided, from control points (nu, nv, 3)."""
-    ways = [np.linalg.norm(np.diff(control_points, axis=axis), axis=2).sum(axis=axis).max() for axis in (0, 1)]
-    return np.maximum(np.ceil(np.array(ways) * TRIMS), 1.0)
 
 
 def scaled_root(covariance: Array) -> tuple[int, Array] | None:

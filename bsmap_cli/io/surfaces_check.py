@@ -9,7 +9,7 @@ import numpy as np
 
 from bsmap_cli.core.bspline import clamped_knots
 from bsmap_cli.io.trim_loops import Sheet, sheet_of, unpack_loop
-from bsmap_cli.io.whole_numbers import CURVES, DIRECTIONS, POINTS, ROOTS, WEIGHTS, from_whole
+from bsmap_cli.io.whole_numbers import CURVES, DIRECTIONS, POINTS, POSES, ROOTS, WEIGHTS, from_pose_root, from_whole
 from bsmap_cli.model import (
     Array,
     BSplineSurface,
@@ -263,11 +263,12 @@ def _pose_covariance(plain: Any, where: str) -> Array:
 
 
 def _pose_part(plain: Any, where: str) -> PosePart:
+    modes, covariance = _modes(plain, where), from_pose_root(_array(plain, "own", (6,), where))
     return PosePart(
         data_set=_get(plain, "data_set", str, where),
         centre=_array(plain, "centre", (2,), where),
-        covariance=_pose_covariance(plain, where),
-        modes=_modes(plain, where),
+        covariance=covariance if modes is None else covariance + modes @ modes.T,
+        modes=modes,
         trajectory=_get(plain, "trajectory", str, where),
     )
 
@@ -275,7 +276,9 @@ def _pose_part(plain: Any, where: str) -> PosePart:
 def _modes(plain: dict[str, Any], where: str) -> Array | None:
     if plain.get("modes") is None:
         return None
-    return np.zeros((3, 0)) if plain["modes"] == [] else _array(plain, "modes", (None, 3), where).T
+    if plain["modes"] == []:
+        return np.zeros((3, 0))
+    return from_whole(_array(plain, "modes", (None, 3), where), POSES).T
 
 
 def _residuals(plain: dict[str, Any], where: str) -> Residuals:

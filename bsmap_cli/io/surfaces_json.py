@@ -3,8 +3,11 @@
     {"format": "bsmap-surfaces", "version": 6, "units": "metres, radians, frame map",
      "bsmap-provenance": {...},
      "data_sets": [{"name", "movement": "translation" | "rotation", "first_scan", "last_scan", "points"}, ...],
-     "poses": [{"data_set", "centre": [x, y], "covariance": [xx, xy, xt, yy, yt, tt],
-                "trajectory": name, "modes": k x 3, or null where it is not known what poses have in common}, ...],
+     "poses": [{"data_set", "centre": [x, y], "trajectory": name,
+                "own": [xx, yx, tx, yy, ty, tt], lower triangle L of the root of the covariance L L' of (x, y, theta)
+                       that the data set has in common with no other one,
+                "modes": k x 3, or null where it is not known what poses have in common}, ...],
+                             both in units of 0.01 mm and 1e-6 rad
      "surfaces": [surface, ...],
      "decisions": [{"outcome": "merged" | "refused" | "moved", "reason", "figures": [names],
                     "pairs": [[first, second, value of each figure, ...], ...]}, ...],
@@ -40,7 +43,7 @@
 
 model/surfaces.py tells what each is. What has units is in whole numbers of them; D: the first one, and of each other
 the difference to the one before. Others are rounded to what they are worth: correlations to 1e-6, knots to 1e-10,
-places of poses to 1e-4, covariances to 4 (those of heights that are nearly singular to 7), modes and residuals to 3
+places of poses to 1e-4, covariances to 4 (those of heights that are nearly singular to 7) and residuals to 3
 significant digits. A map that was read is written again byte for byte.
 """
 
@@ -64,8 +67,10 @@ from bsmap_cli.io.whole_numbers import (
     CURVES,
     DIRECTIONS,
     POINTS,
+    POSES,
     WEIGHTS,
     from_whole,
+    pose_root,
     runs_of,
     scaled_root,
     whole,
@@ -207,9 +212,9 @@ def _pose_part(part: PosePart) -> dict[str, Any]:
     return {
         "data_set": part.data_set,
         "centre": _rounded(part.centre, 4),
-        "covariance": _significant(_upper(part.covariance), 4),
         "trajectory": part.trajectory,
-        "modes": None if part.modes is None else _significant(part.modes.T, 3),
+        "own": pose_root(part.own),
+        "modes": None if part.modes is None else whole(part.modes.T, POSES),
     }
 
 

@@ -15,6 +15,8 @@ from bsmap_cli.model import Array, Decision
 
 POINTS, CURVES, DIRECTIONS, WEIGHTS = 1e5, 1e4, 1e5, 1e4
 """Units in a metre, of control points and of creases and corners; in 1, of directions, and of weights of poses."""
+POSES = np.array([1e5, 1e5, 1e6])
+"""Units in a metre, a metre and a radian, of errors of pose (x, y, theta)."""
 ROOTS = 1e8
 """Units in a metre of roots of heights' covariances, before they are scaled."""
 LEAST_ROOT = 100.0
@@ -59,6 +61,21 @@ def scaled_root(covariance: Array) -> tuple[int, Array] | None:
             break
         found = scale, coarser
     return found
+
+
+def pose_root(own: Array) -> list[int]:
+    """Lower triangle, column by column, of the root of a covariance (3, 3) of errors of pose."""
+    root = rounded_root(own * np.outer(POSES, POSES), 1.0, 0.0)
+    assert root is not None
+    return [int(value) for value in root.T[np.triu_indices(3)]]
+
+
+def from_pose_root(numbers: Array) -> Array:
+    """The covariance (3, 3) that `pose_root` gave as numbers (6,)."""
+    root = np.zeros((3, 3))
+    root.T[np.triu_indices(3)] = numbers
+    root /= POSES[:, None]
+    return np.asarray(root @ root.T)
 
 
 def runs_of(decisions: Iterable[Decision]) -> list[dict[str, Any]]:

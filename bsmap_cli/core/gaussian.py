@@ -52,9 +52,7 @@ def rounded_root(covariance: Array, unit: float, least: float) -> Array | None:
         if pivot < least:
             return None
         root[k, k] = pivot
-        # No more than a variance holds: a small pivot that was rounded down would make it larger.
-        most = np.floor(np.sqrt(np.maximum(np.diag(left)[k + 1 :], 0.0)))
-        root[k + 1 :, k] = np.clip(np.rint(left[k + 1 :, k] / pivot), -most, most) if pivot > 0.0 else 0.0
+        root[k + 1 :, k] = np.rint(left[k + 1 :, k] / pivot)
         left -= np.outer(root[:, k], root[:, k])
     return root
 

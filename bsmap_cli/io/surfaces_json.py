@@ -4,8 +4,8 @@
      "bsmap-provenance": {...},
      "data_sets": [{"name", "movement": "translation" | "rotation", "first_scan", "last_scan", "points"}, ...],
      "poses": [{"data_set", "centre": [x, y], "trajectory": name,
-                "own": [xx, yx, tx, yy, ty, tt], lower triangle L of the root of the covariance L L' of (x, y, theta)
-                       that the data set has in common with no other one,
+                "own": [xx, xy, xt, yy, yt, tt], symmetric root of the covariance of what of (x, y, theta) the data set
+                       has in common with no other one,
                 "modes": k x 3, or null where it is not known what poses have in common}, ...],
                              both in units of 0.01 mm and 1e-6 rad
      "surfaces": [surface, ...],

@@ -10,13 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bsmap_cli.core.gaussian import rounded_root
+from bsmap_cli.core.gaussian import rounded_root, symmetric_sqrt
 from bsmap_cli.model import Array, Decision
 
 POINTS, CURVES, DIRECTIONS, WEIGHTS = 1e5, 1e4, 1e5, 1e4
 """Units in a metre, of control points and of creases and corners; in 1, of directions, and of weights of poses."""
 POSES = np.array([1e5, 1e5, 1e6])
 """Units in a metre, a metre and a radian, of errors of pose (x, y, theta)."""
+MOST_ROUNDS = 20
+"""In which the rounded root of a singular covariance settles."""
 ROOTS = 1e8
 """Units in a metre of roots of heights' covariances, before they are scaled."""
 LEAST_ROOT = 100.0
@@ -64,18 +66,25 @@ def scaled_root(covariance: Array) -> tuple[int, Array] | None:
 
 
 def pose_root(own: Array) -> list[int]:
-    """Lower triangle, column by column, of the root of a covariance (3, 3) of errors of pose."""
-    root = rounded_root(own * np.outer(POSES, POSES), 1.0, 0.0)
-    assert root is not None
-    return [int(value) for value in root.T[np.triu_indices(3)]]
+    """Upper triangle, row by row, of the symmetric root of a covariance (3, 3) of errors of pose.
+
+    It is rounded until it is the root of its own square.
+    """
+    root = np.rint(symmetric_sqrt(own * np.outer(POSES, POSES)))
+    for _ in range(MOST_ROUNDS):
+        again = np.rint(symmetric_sqrt(root @ root))
+        if np.array_equal(again, root):
+            break
+        root = again
+    return [int(value) for value in root[np.triu_indices(3)]]
 
 
 def from_pose_root(numbers: Array) -> Array:
     """The covariance (3, 3) that `pose_root` gave as numbers (6,)."""
     root = np.zeros((3, 3))
-    root.T[np.triu_indices(3)] = numbers
-    root /= POSES[:, None]
-    return np.asarray(root @ root.T)
+    root[np.triu_indices(3)] = numbers
+    root += np.triu(root, 1).T
+    return np.asarray(root @ root / np.outer(POSES, POSES))
 
 
 def runs_of(decisions: Iterable[Decision]) -> list[dict[str, Any]]:

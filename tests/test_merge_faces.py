@@ -292,3 +292,16 @@ def test_merged_faces_are_written_and_read(tmp_path):
     write_surfaces(tmp_path / "b.map.json", again)
     assert (tmp_path / "a.map.json").read_bytes() == (tmp_path / "b.map.json").read_bytes()
     assert len(again.creases) == len(result.creases) > 0
+
+
+def test_gap_beside_a_ragged_outline_is_closed_without_a_spike():
+    """Three data sets at the edge of a recess, as in a simulated room; mitres stood out 4.6 cm over all of them."""
+    straight = [(-0.101, -0.051), (-0.101, -0.25), (-0.25, -0.25), (-0.25, -0.057)]
+    ragged = [(0.007, -0.055), (0.003, -0.047), (0.007, -0.054), (0.007, -0.049), (0.008, -0.055), (0.012, -0.061)]
+    ragged += [(0.007, -0.047), (0.022, -0.054), (0.02, -0.048), (0.038, -0.052), (0.036, -0.046), (0.053, -0.045)]
+    ragged += [(0.094, -0.056), (0.092, -0.044), (0.25, -0.046), (0.25, -0.25), (0.009, -0.25)]
+    sloping = [(-0.191, -0.074), (-0.092, -0.053), (0.009, -0.052), (0.011, -0.25), (-0.25, -0.25), (-0.25, -0.075)]
+    regions = [region_of([np.array(corners)]) for corners in (straight, ragged, sloping)]
+    whole = united(regions, 0.1)
+    assert whole.bounds[3] < -0.043
+    assert whole.area > sum(regions[k].area for k in (0, 1))

@@ -26,6 +26,8 @@ STEP = 0.05
 """Metres between vertices of an outline that is laid on another surface."""
 PLACES = 100
 """About so many of an overlap at which data sets are counted."""
+MOST_PLACES = 10_000
+"""Of a grid around it from which these are taken."""
 
 
 def cut_back(
@@ -67,10 +69,12 @@ def _overlaps(
     both = shapely.intersection(left[a], _laid(left[b], fields[b], fields[a]), grid_size=GRID)
     found = []
     for part in parts(both):
+        if part.area < LEAST_AREA:
+            continue
         points = _places(part, fields[a])
         apart = np.abs(_above(points, fields[b]))
         along = np.abs(np.sum(_normals(points, fields[a]) * _normals(points, fields[b]), axis=1))
-        if part.area > LEAST_AREA and apart.min() < CLOSE and apart.max() < distance and along.max() > ALIKE:
+        if apart.min() < CLOSE and apart.max() < distance and along.max() > ALIKE:
             found.append(part)
     return found
 
@@ -105,8 +109,9 @@ def _above(points: Array, field: HeightField) -> Array:
 
 def _places(part: Region, field: HeightField) -> Array:
     """(n, 3) points of a field all over a part of its base."""
-    step = np.sqrt(part.area / PLACES)
     low_s, low_t, high_s, high_t = part.bounds
+    # Of a narrow part that runs askew few places of a grid lie inside.
+    step = np.sqrt(max(part.area / PLACES, (high_s - low_s) * (high_t - low_t) / MOST_PLACES))
     s, t = (np.arange(low + step / 2.0, high, step) for low, high in ((low_s, high_s), (low_t, high_t)))
     grid = np.stack(np.meshgrid(s, t, indexing="ij"), axis=-1).reshape(-1, 2)
     inside = grid[shapely.contains_xy(part, grid)]

@@ -114,8 +114,9 @@ UPWARDS = {"directions": [[[0, 0, 100_000]]], "weights": []}
 @pytest.mark.parametrize(
     ("value", "way", "message"),
     [
-        (["a"], ("creases", 0, "surfaces"), r"creases\[0\]: surfaces has 1 names, wanted 2"),
-        (["a", "c"], ("creases", 0, "surfaces"), r"creases\[0\]: there is no surface 'c'"),
+        ([0], ("creases", 0, "surfaces"), r"creases\[0\]: surfaces is 1, wanted 2"),
+        ([0, 2], ("creases", 0, "surfaces"), r"creases\[0\]: surfaces\[1\] is 2, wanted -1 or a number of a surface"),
+        ([0, -1], ("creases", 0, "surfaces"), r"creases\[0\]: surfaces holds -1, wanted two numbers of surfaces"),
         ([[0, 0]], ("creases", 0, "points"), r"points is 1 x 2, wanted any x 3"),
         ([], ("creases", 0, "points"), r"creases\[0\]: has 1 points with its corners, wanted 2 or more"),
         ([0, 1], ("creases", 0, "corners"), r"corners\[1\] is 1, wanted -1 or a number of a corner"),

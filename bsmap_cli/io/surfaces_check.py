@@ -44,17 +44,15 @@ def parse_map(plain: dict[str, Any]) -> SurfaceMap:
     """Surfaces of a file's JSON object; MalformedError where it does not make sense."""
     corners = from_whole(_points(plain, "corners", "file"), CURVES, (0,))
     poses = _poses(_get(plain, "poses", list, "file"))
-    creases = tuple(_crease(c, corners, f"creases[{i}]") for i, c in enumerate(_get(plain, "creases", list, "file")))
-    lines = [crease.points for crease in creases]
-    surfaces = tuple(
-        _surface(s, f"surfaces[{i}]", lines, poses) for i, s in enumerate(_get(plain, "surfaces", list, "file"))
-    )
-    counts = Counter(surface.name for surface in surfaces)
+    names = [_get(s, "name", str, f"surfaces[{i}]") for i, s in enumerate(_get(plain, "surfaces", list, "file"))]
+    counts = Counter(names)
     if twice := sorted(name for name, count in counts.items() if count > 1):
         raise MalformedError(f"surfaces: the name {twice[0]!r} is there twice")
-    for i, crease in enumerate(creases):
-        if unknown := [name for name in crease.surfaces if name not in counts]:
-            raise MalformedError(f"creases[{i}]: there is no surface {unknown[0]!r}")
+    creases = tuple(
+        _crease(c, corners, names, f"creases[{i}]") for i, c in enumerate(_get(plain, "creases", list, "file"))
+    )
+    lines = [crease.points for crease in creases]
+    surfaces = tuple(_surface(s, f"surfaces[{i}]", lines, poses) for i, s in enumerate(plain["surfaces"]))
     return SurfaceMap(
         surfaces=surfaces,
         data_sets=tuple(_data_set(d, f"data_sets[{i}]") for i, d in enumerate(_get(plain, "data_sets", list, "file"))),
@@ -72,17 +70,17 @@ def parse_map(plain: dict[str, Any]) -> SurfaceMap:
     )
 
 
-def _crease(plain: Any, corners: Array, where: str) -> Crease:
-    names = _names(plain, "surfaces", where)
-    if len(names) != 2:
-        raise MalformedError(f"{where}: surfaces has {len(names)} names, wanted 2")
+def _crease(plain: Any, corners: Array, surfaces: Sequence[str], where: str) -> Crease:
+    numbers = _numbers(plain, "surfaces", 2, len(surfaces), "surface", where).tolist()
+    if -1 in numbers:
+        raise MalformedError(f"{where}: surfaces holds -1, wanted two numbers of surfaces")
     first, last = _numbers(plain, "corners", 2, len(corners), "corner", where).tolist()
     ends = [corners[k : k + 1] if k >= 0 else np.zeros((0, 3)) for k in (first, last)]
     inner = from_whole(_points(plain, "points", where), CURVES, (0,))
     points = np.concatenate([ends[0], inner, ends[1]])
     if len(points) < 2:
         raise MalformedError(f"{where}: has {len(points)} points with its corners, wanted 2 or more")
-    return Crease((names[0], names[1]), points, (first, last))
+    return Crease((surfaces[numbers[0]], surfaces[numbers[1]]), points, (first, last))
 
 
 def _points(plain: Any, key: str, where: str) -> Array:

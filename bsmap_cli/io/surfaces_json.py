@@ -12,7 +12,7 @@
      "decisions": [{"outcome": "merged" | "refused" | "moved", "reason", "figures": [names],
                     "pairs": [[first, second, value of each figure, ...], ...]}, ...],
      "corners": k x 3 points in which creases end together, units of 0.1 mm, D
-     "creases": [{"surfaces": [name, name], "corners": [first, last],
+     "creases": [{"surfaces": [number, number], "corners": [first, last],
                   "points": k x 3 polyline, units of 0.1 mm, D}, ...],
                              corners: their numbers, -1 for a free end; corners are not among the points
      "placements": [{"survey", "pose": [x, y, turn], "height", "covariance": [xx, xy, xt, yy, yt, tt],
@@ -43,14 +43,14 @@
 
 model/surfaces.py tells what each is. What has units is in whole numbers of them; D: the first one, and of each other
 the difference to the one before. Others are rounded to what they are worth: correlations to 1e-6, knots to 1e-10,
-places of poses to 1e-4, covariances to 4 (those of heights that are nearly singular to 7) and residuals to 3
+places of poses to 1e-4, covariances to 4 (those of heights that are nearly singular to 7) and residuals to 2
 significant digits. A map that was read is written again byte for byte.
 """
 
 import gzip
 import json
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -104,6 +104,7 @@ def write_surfaces(path: Path | str, surfaces: SurfaceMap, provenance: Provenanc
     head = {"format": FORMAT, "version": VERSION, "units": "metres, radians, frame map"}
     if provenance is not None:
         head |= {"bsmap-provenance": provenance.to_dict()}
+    numbers = {surface.name: number for number, surface in enumerate(surfaces.surfaces)}
     lines = [_stored_line(crease) for crease in surfaces.creases]
     parts = [
         _dumps(head)[1:-1],
@@ -112,7 +113,7 @@ def write_surfaces(path: Path | str, surfaces: SurfaceMap, provenance: Provenanc
         _list("surfaces", [_surface(surface, lines) for surface in surfaces.surfaces]),
         _list("decisions", [plain_json(run) for run in runs_of(surfaces.decisions)]),
         _list("corners", whole(surfaces.corners, CURVES, (0,))),
-        _list("creases", [_crease(crease) for crease in surfaces.creases]),
+        _list("creases", [_crease(crease, numbers) for crease in surfaces.creases]),
         _list("placements", [_placement(placement) for placement in surfaces.placements]),
         f'"notes":{_dumps(plain_json(surfaces.notes))}',
     ]
@@ -151,7 +152,7 @@ def _surface(surface: BSplineSurface, lines: Sequence[Array]) -> dict[str, Any]:
         "knots_v": _rounded(inner_v, 10),
         "control_points": net,
         "covariance": _covariance(surface.covariance) | {"weights": _weights(surface)},
-        "residuals": [int(surface.residuals.points), *_significant(list(vars(surface.residuals).values())[1:], 3)],
+        "residuals": [int(surface.residuals.points), *_significant(list(vars(surface.residuals).values())[1:], 2)],
         "trims": [_loop(loop, sheet, lines) for loop in surface.trims],
     }
 
@@ -161,11 +162,11 @@ def _loop(loop: TrimLoop, sheet: Sheet, lines: Sequence[Array]) -> dict[str, Any
     return {"parameters": numbers.tolist(), "creases": creases.tolist()}
 
 
-def _crease(crease: Crease) -> dict[str, Any]:
+def _crease(crease: Crease, numbers: Mapping[str, int]) -> dict[str, Any]:
     first, last = (corner >= 0 for corner in crease.corners)
     points = crease.points[int(first) : len(crease.points) - int(last)]
     return {
-        "surfaces": list(crease.surfaces),
+        "surfaces": [numbers[name] for name in crease.surfaces],
         "corners": [int(corner) for corner in crease.corners],
         "points": whole(points, CURVES, (0,)),
     }

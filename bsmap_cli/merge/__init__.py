@@ -77,16 +77,15 @@ def merge_surfaces(maps: Sequence[SurfaceMap], params: MergeParams, *, track: Tr
             mergings += 1
             _replace(search, pair, result.patches)
     track("merging surfaces", search.tested, search.tested)
-    notes = {"pairs_tested": search.tested, "mergings": mergings, "pairs_left_at_limit": len(search.waiting)}
+    tested = {"pairs_tested": search.tested, "mergings": mergings, "pairs_left_at_limit": len(search.waiting)}
+    notes = (tested if surfaces else {}) | faces.notes
     merged = tuple(patch.surface for patch in search.patches.values())
     decisions = (*united.decisions, *faces.decisions, *search.decisions)
     summed = Summed([*merged, *faces.surfaces], united.data_sets)
     if len(maps) > 1 and settled:
         summed = sum_up(*summed, survey_of_set)
     creases, corners = tuple(faces.creases), faces.corners
-    return SurfaceMap(
-        tuple(summed.surfaces), summed.data_sets, decisions, notes | faces.notes, creases, corners, placements
-    )
+    return SurfaceMap(tuple(summed.surfaces), summed.data_sets, decisions, notes, creases, corners, placements)
 
 
 def _test(search: _Search, pairs: Iterable[tuple[int, int]]) -> None:

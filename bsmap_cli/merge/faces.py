@@ -93,7 +93,8 @@ def _key(surface: BSplineSurface) -> tuple[float, ...]:
 
 
 def _largest(corrections: dict[str, Correction]) -> float:
-    return max((float(np.linalg.norm(c.error[:2])) for c in corrections.values()), default=0.0)
+    largest = max((float(np.linalg.norm(c.error[:2])) for c in corrections.values()), default=0.0)
+    return float(f"{largest:.3g}")
 
 
 def _left(others: Sequence[BSplineSurface]) -> list[Decision]:

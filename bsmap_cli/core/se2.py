@@ -55,12 +55,24 @@ def from_matrix(mount: Array) -> Array:
 
 
 def interpolate(time_ns: IntArray, poses: Array, at_ns: IntArray) -> Array:
-    """Poses (k, 3) at times `at_ns` (k,), linear in x, y and unwrapped theta; outside, the first or last pose.
+    """Poses (k, 3) at times `at_ns` (k,), on the arc of constant speed and turn rate from the pose before to the next.
+
+    A robot that turns goes round, not along the chord: 0.3 mm beside it after 0.1 s at 0.5 m/s and 0.5 rad/s. Outside
+    of the times, the first or last pose. The shorter way round is taken. Exponential map of SE(2), Sola et al. (2018).
 
     time_ns : (n,) ascending.  poses : (n, 3).
     """
-    origin = time_ns[0]
-    t, at = (time_ns - origin).astype(float), (at_ns - origin).astype(float)
-    theta = np.unwrap(poses[:, 2])
-    out = [np.interp(at, t, poses[:, 0]), np.interp(at, t, poses[:, 1]), wrap(np.interp(at, t, theta))]
-    return np.stack(out, axis=-1)
+    n = len(time_ns)
+    if n == 1:
+        return np.repeat(poses, len(at_ns), axis=0)
+    before = (np.searchsorted(time_ns, at_ns, side="right") - 1).clip(0, n - 2)
+    gone = np.clip(at_ns - time_ns[before], 0, None).astype(float)
+    share = np.minimum(gone / np.maximum(time_ns[before + 1] - time_ns[before], 1), 1.0)
+    step = between(poses[before], poses[before + 1])
+    turn = step[:, 2]
+    # The part of an arc is as long as the whole one's chord by the ratio of sines, and leaves under half its turn.
+    length = share * np.sinc(share * turn / _TURN) / np.sinc(turn / _TURN)
+    away = (share - 1.0) * turn / 2.0
+    c, s = np.cos(away), np.sin(away)
+    x, y = length * (c * step[:, 0] - s * step[:, 1]), length * (s * step[:, 0] + c * step[:, 1])
+    return compose(poses[before], np.stack([x, y, share * turn], axis=1))

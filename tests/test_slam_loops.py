@@ -10,6 +10,8 @@ from bsmap_cli.params import SlamParams
 from bsmap_cli.slam import loops, run_slam
 from bsmap_cli.slam.loops import close_loops
 from bsmap_cli.slam.posegraph import Edges
+from bsmap_cli.slam.recognition import FEWEST_WITNESSES, witnesses
+from bsmap_cli.slam.submaps import Search
 from bsmap_cli.slam.tracking import Tracking, track_scans
 from bsmap_cli.track import silent
 
@@ -111,9 +113,9 @@ def test_places_alike_side_by_side_are_not_taken_for_one():
         np.testing.assert_allclose(found.poses, drifted.poses[tracking.keys], atol=0.02)
 
 
-def look(poses: np.ndarray) -> loops._Search:
+def look(poses: np.ndarray) -> Search:
     way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
-    return loops._Search([], poses, way, 0.03)
+    return Search([], poses, way, 0.03)
 
 
 def edges(*found: tuple[int, int, tuple[float, float, float]]) -> Edges:
@@ -151,12 +153,12 @@ def test_closure_that_stands_alone_finds_the_others_that_bear_it_out(lap):
     assert np.hypot(*(seen.poses[first] - seen.poses[last])[:2]) > 3.0, "the drift hides the place"
     there = se2.between(truth[first], truth[last])
     true = edges((first, last, tuple(there)))
-    found = loops._witnesses(seen, true)
-    assert len(found.first) >= loops.FEWEST_WITNESSES
+    found = witnesses(seen, true)
+    assert len(found.first) >= FEWEST_WITNESSES
     assert wrong(found, truth).max() < 0.1
     assert loops._supported(seen, Edges(*map(np.concatenate, zip(true, found, strict=True)))).all()
     false = edges((first, last, tuple(there + np.array([1.5, 1.0, 0.3]))))
-    assert len(loops._witnesses(seen, false).first) == 0
+    assert len(witnesses(seen, false).first) == 0
 
 
 def test_false_closure_among_true_ones_is_refused_and_reported(lap, monkeypatch):

@@ -16,6 +16,7 @@ from bsmap_cli.slam.motion import beam_motion, odometry_motion
 from bsmap_cli.slam.posegraph import Edges
 from bsmap_cli.slam.segments import Segments, extract_segments, scan_batches
 from bsmap_cli.slam.smoothing import Evidence, Smoothed, smooth
+from bsmap_cli.slam.submaps import agree
 from bsmap_cli.slam.tracking import MATCH_FLOOR, Tracking, limited, track_scans
 from bsmap_cli.slam.upkeep import with_positive_offset
 from bsmap_cli.track import Track
@@ -112,8 +113,9 @@ def _unexplained(log: ScanLog, tracking: Tracking, closures: Closures, segments:
 def _every_scan(tracking: Tracking, poses: Array, known: Marginals) -> tuple[Array, Array, Array]:
     """Poses (n, 3), covariances (n, 3, 3) and modes (n, 3, k) of all scans from those of the key scans.
 
-    Between two key scans the tracked motion is kept; what it misses of the way to the second one is spread over it. So
-    the error is a share of either key scan's, which are correlated, and of the match's own.
+    Between two key scans the tracked motion is kept; what it misses of the way to the second one is spread over it,
+    unless it is a break: then all follow the first. So the error is a share of either key scan's, which are correlated,
+    and of the match's own.
     """
     n, keys, tracked = len(tracking.poses), tracking.keys, tracking.poses
     before = np.searchsorted(keys, np.arange(n), side="right") - 1
@@ -121,7 +123,7 @@ def _every_scan(tracking: Tracking, poses: Array, known: Marginals) -> tuple[Arr
     forward = se2.compose(poses[before], se2.between(tracked[keys[before]], tracked))
     backward = se2.compose(poses[after], se2.between(tracked[keys[after]], tracked))
     span = np.maximum(keys[after] - keys[before], 1)
-    share = np.where(after > before, (np.arange(n) - keys[before]) / span, 0.0)[:, None]
+    share = np.where((after > before) & agree(forward, backward), (np.arange(n) - keys[before]) / span, 0.0)[:, None]
     miss = backward - forward
     miss[:, 2] = se2.wrap(miss[:, 2])
     every = forward + share * miss

@@ -20,7 +20,15 @@ from bsmap_cli.slam.matching import (
     oriented_points,
     search,
 )
-from bsmap_cli.slam.motion import Motion, OdometryScale, beam_motion, constant_velocity, odometry_motion
+from bsmap_cli.slam.motion import (
+    MAX_SPEED,
+    MAX_TURN_RATE,
+    Motion,
+    OdometryScale,
+    beam_motion,
+    constant_velocity,
+    odometry_motion,
+)
 from bsmap_cli.slam.posegraph import Edges
 from bsmap_cli.slam.segments import scan_batches
 from bsmap_cli.track import Track
@@ -33,6 +41,8 @@ first so far from the prediction (squared Mahalanobis distance), the match is no
 MATCH_FLOOR = np.array([0.003, 0.003, 0.0015])
 """Metres and radians that a match is off at the least, for walls are rough."""
 MOST_POINTS = 400
+JUMP, GAP = (0.5, 0.5), 10.0
+"""Metres and radians of odometry beyond what speed allows, and seconds, after which a robot may be anywhere."""
 LEAST_SPREAD = np.array([0.02, 0.02, 0.01])
 """Metres and radians by which a prediction can be off however short the step."""
 
@@ -43,6 +53,7 @@ class Tracking(NamedTuple):
     points : of each key scan, in base_link.  edges : from each key scan but the first to an earlier one.
     match_information : (k - 1, 3, 3), what the match alone says of each edge.
     weak : (k,) key scans whose match failed, so that their edge holds no more than the motion prior.
+    adrift : (k,) key scans before which nothing tells the motion: no odometry, a jump of it, or a long gap.
     odometry_scale : metres of way for a metre of odometry.  matched : (n,) scans that a good match placed.
     """
 
@@ -52,6 +63,7 @@ class Tracking(NamedTuple):
     edges: Edges
     match_information: Array
     weak: NDArray[np.bool_]
+    adrift: NDArray[np.bool_]
     odometry_scale: float
     matched: NDArray[np.bool_]
 
@@ -92,7 +104,21 @@ def track_scans(log: ScanLog, range_sigma: float, params: SlamParams, track: Tra
     chain = _chain(poses[keys], information, np.array(inliers))
     match_information = np.array(by_match).reshape(-1, 3, 3)
     weak = np.array(inliers) < WEAK
-    return Tracking(poses, np.array(keys), key_points, chain, match_information, weak, scale.value, matched)
+    adrift = _adrift(log, np.array(keys))
+    return Tracking(poses, np.array(keys), key_points, chain, match_information, weak, adrift, scale.value, matched)
+
+
+def _adrift(log: ScanLog, keys: IntArray) -> NDArray[np.bool_]:
+    """(k,) key scans to which the robot did not get from the one before in the way that odometry and stamps tell."""
+    if log.odometry is None:
+        return np.arange(len(keys)) > 0
+    seconds = np.diff(log.horizontal.time_ns[keys]) * 1e-9
+    step = se2.between(log.odometry[keys[:-1]], log.odometry[keys[1:]])
+    time = np.maximum(seconds, 0.0)
+    jump = (np.hypot(step[:, 0], step[:, 1]) > JUMP[0] + MAX_SPEED * time) | (
+        np.abs(step[:, 2]) > JUMP[1] + MAX_TURN_RATE * time
+    )
+    return np.concatenate([[False], jump | (seconds > GAP)])
 
 
 def _local(inliers: list[float]) -> list[int]:

@@ -234,8 +234,9 @@ def bases(blocks: Blocks, sigma: float) -> list[Base]:
 
 def _rectangle(grid: BeamGrid, member: NDArray[np.bool_], base: Base) -> tuple[Array, Array]:
     """Corners (2,) in s and t of the rectangle around a face's beams, with room for a cell of the grid beyond them."""
-    row, column = np.nonzero(member & grid.hit)
-    at = base.local(grid.points[row, column])[:, :2]
+    place = np.flatnonzero(member & grid.hit)
+    row, column = np.divmod(place, member.shape[1])
+    at = base.local(grid.points.reshape(-1, 3)[place])[:, :2]
     low, high = at.min(axis=0), at.max(axis=0)
     st = np.full((int(np.ptp(row)) + 1, int(np.ptp(column)) + 1, 2), np.nan)
     st[row - row.min(), column - column.min()] = at

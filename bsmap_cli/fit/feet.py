@@ -10,7 +10,7 @@ from bsmap_cli.core.pieces import CHUNK, Spans, horner
 from bsmap_cli.fit.heights import CylinderBase, HeightField
 from bsmap_cli.model import Array, IntArray
 
-SETTLED = 5e-4
+SETTLED = 1e-4
 """Metres; behind a step of Newton's method below this what is left is its square times the curvature: micrometres."""
 STEEPEST = 0.05
 """Smallest sine between beam and surface that counts."""
@@ -204,10 +204,15 @@ def _newton(table: Table, face: IntArray, p: Array, d: Array, start: Array, step
         slope = _steep(turn[2] - climb)
         move = np.clip((local[2] - height) / slope, -FARTHEST, FARTHEST)
         beyond -= move
-        if step == steps - 1 or np.abs(move).max(initial=0.0) < SETTLED:
+        left = np.flatnonzero(np.abs(move) >= SETTLED) if step < steps - 1 else at[:0]
+        if 2 * len(left) <= len(move):
             break
     uv -= move * turn[:2] / table.size.take(face, axis=1)
-    return uv, np.stack([beyond, slope, height - move * climb])
+    rest = np.stack([beyond, slope, height - move * climb])
+    if len(left):  # few beams, most often grazing ones, need more steps than the others
+        few = face if len(face) == 1 else face[left]
+        uv[:, left], rest[:, left] = _newton(table, few, p[:, left], d[:, left], beyond[left], steps - 1 - step)
+    return uv, rest
 
 
 def _on_bilinear(table: Table, face: IntArray, p: Array, d: Array, start: Array, steps: int) -> tuple[Array, Array]:

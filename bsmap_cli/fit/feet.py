@@ -10,8 +10,8 @@ from bsmap_cli.core.pieces import CHUNK, Spans, horner
 from bsmap_cli.fit.heights import CylinderBase, HeightField
 from bsmap_cli.model import Array, IntArray
 
-SETTLED = 1e-4
-"""Metres; behind a step of Newton's method below this what is left is its square times the curvature: micrometres."""
+SETTLED = 1e-5
+"""Metres; behind a step of Newton's method below this what is left is its square times the curvature: nothing."""
 STEEPEST = 0.05
 """Smallest sine between beam and surface that counts."""
 FARTHEST = 5.0

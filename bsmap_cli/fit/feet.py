@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -77,7 +78,12 @@ class Table(NamedTuple):
 
 
 def tabulate(fields: Sequence[HeightField]) -> Table:
-    """Table of height fields, in their order."""
+    """Table of height fields, in their order; made once for the same fields, which are asked about many times."""
+    return _tabulated(tuple(fields))
+
+
+@lru_cache(maxsize=16)
+def _tabulated(fields: tuple[HeightField, ...]) -> Table:
     frame, radius, middle = np.empty((12, len(fields))), np.zeros(len(fields)), np.zeros(len(fields))
     for k, field in enumerate(fields):
         base = field.base
@@ -107,7 +113,7 @@ def _joined(spans: Sequence[Spans]) -> Lines:
     """Spans along one direction of all faces."""
     none = np.zeros(0)
     count = np.array([len(of.middle) for of in spans], dtype=np.int64)
-    begins = np.concatenate([none, *(np.append(0.0, of.inner[:-1]) + 2.0 * k for k, of in enumerate(spans))])
+    begins = np.concatenate([none, *([2.0 * k, *(of.inner[:-1] + 2.0 * k)] for k, of in enumerate(spans))])
     middles, scales = (np.concatenate([none, *of]) for of in ([s.middle for s in spans], [s.scale for s in spans]))
     return Lines(begins, middles, scales, np.cumsum(count) - count, count)
 

@@ -33,6 +33,8 @@ LEAST_BLOCKS = 4.0
 """Of each control point: what needs more than that is not smooth."""
 MOST_STEPS = 40
 """Of one search."""
+NEAR = 0.1
+"""Standard deviations of a beam by which heights may change before the equations are made anew."""
 SETTLED = 1e-5
 """Metres of change of the heights below which a fit about its own result is not repeated."""
 MOST = 400
@@ -98,14 +100,20 @@ def fit_heights(blocks: Blocks, base: Base, low: Array, high: Array, sigma: floa
     knots = least_knots(base, low, high)
     field = HeightField(base, low, high, knots, np.zeros(knots.shape))
     data = _linearise(field, blocks, sigma)
-    best = _solve(knots, data)
-    # First roughly; pairs of steps are tried about the surface that this gives.
-    for kinds in ((_single_steps,), (_single_steps, _double_steps, _fewer_steps)):
-        best = _climb(best, data, kinds)
+    best = _climb(_solve(knots, data), data, (_single_steps,))
+    if _is_near(best, field, sigma):
+        # Single steps have been tried about this very surface.
+        best = _climb(best, data, (_double_steps, _fewer_steps))
+    if not _is_near(best, field, sigma):
         field = best.on(field)
         data = _linearise(field, blocks, sigma, data)
-        best = _solve(best.knots, data)
+        best = _climb(_solve(best.knots, data), data, (_single_steps, _double_steps, _fewer_steps))
     return _settled(best.on(field), blocks, sigma, data)
+
+
+def _is_near(best: _Solution, field: HeightField, sigma: float) -> bool:
+    """Whether a solution is the field about which it was found, or so near it that its feet are the same."""
+    return best.knots is field.knots and bool(np.abs(best.heights - field.heights.ravel()).max() < NEAR * sigma)
 
 
 def refit(field: HeightField, blocks: Blocks, sigma: float, fewer: bool = False) -> Fitted:

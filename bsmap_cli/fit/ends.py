@@ -114,7 +114,9 @@ def passed_through(grid: BeamGrid, labels: IntArray, table: Table, crossings: Cr
 class _End:
     """One end of the runs of k beams: the face met there, or the plane across the scan line at the last beam."""
 
-    def __init__(self, grid: BeamGrid, table: Table, ends: Ends, side: int, row: IntArray, column: IntArray) -> None:
+    def __init__(
+        self, grid: BeamGrid, table: Table, ends: Ends, side: int | IntArray, row: IntArray, column: IntArray
+    ) -> None:
         self.table, self.face = table, ends.face[side, row, column]
         last, inner = ends.last[side, row, column], ends.inner[side, row, column]
         self.place = grid.points[row, last]
@@ -173,40 +175,39 @@ def doubtful_cells(
     grid's points lie on their faces: with their noise they would seem to lie beyond.
     """
     bad = _behind(grid, labels, table, ends)
-    straight, rising, falling = (_through(grid, labels, table, crossings, ends, step) for step in (0, 1, -1))
+    straight, rising, falling = _through(grid, labels, table, crossings, ends)
     return np.asarray((bad | straight)[:, :-1] | (bad | straight)[:, 1:] | rising[:, :-1] | falling[:, 1:])
 
 
-def _through(
-    grid: BeamGrid,
-    labels: IntArray,
-    table: Table,
-    crossings: Crossings,
-    ends: Ends,
-    step: int,
-) -> NDArray[np.bool_]:
-    """(m - 1, n) whether a beam and the one `step` later in the next scan hit one face, with an end in between.
+def _through(grid: BeamGrid, labels: IntArray, table: Table, crossings: Crossings, ends: Ends) -> NDArray[np.bool_]:
+    """(3, m - 1, n) whether a beam and one of the next scan hit one face, with an end in between.
 
-    An end of one of the two runs, that is: the other beam lies beyond it.
+    The beam of the next scan is the same one, that behind it or, last, that before it. The end is that of one of both
+    runs: the other beam lies beyond it.
     """
-    m, n = labels.shape
-    bad = np.zeros((m - 1, n), dtype=bool)
-    own, other = slice(max(0, -step), n - max(0, step)), slice(max(0, step), n - max(0, -step))
-    same = (labels[:-1, own] == labels[1:, other]) & (labels[:-1, own] >= 0)
-    same &= grid.hit[:-1, own] & grid.hit[1:, other]
+    (m, n), steps = labels.shape, (0, 1, -1)
+    bad = np.zeros((len(steps), m - 1, n), dtype=bool)
     met = _corners(labels, crossings)
-    for side in (0, 1):
-        # Two runs that end at the same face say nothing of what is between them, nor do two that end openly.
-        r, c = np.nonzero(same & (ends.face[side, :-1, own] != ends.face[side, 1:, other]))
-        c += own.start
-        first, second = (_End(grid, table, ends, side, r + k, c + k * step) for k in (0, 1))
-        here, there = grid.points[r, c], grid.points[r + 1, c + step]
-        a0, a1, b0, b1 = first.beyond(here), first.beyond(there), second.beyond(here), second.beyond(there)
-        corner = met[r, first.face, second.face]
-        wrong = ((first.face >= 0) & (a1 > THROUGH)) | ((second.face >= 0) & (b0 > THROUGH))
-        # The way from one beam to the other leaves the first's side before it comes to the second's.
-        leaves = (a1 > THROUGH) & (b0 > THROUGH) & (_zero(a0, a1) < _zero(b0, b1))
-        bad[r, c] |= np.where(corner, leaves, wrong)
+    found = []
+    for number, step in enumerate(steps):
+        own, other = slice(max(0, -step), n - max(0, step)), slice(max(0, step), n - max(0, -step))
+        same = (labels[:-1, own] == labels[1:, other]) & (labels[:-1, own] >= 0)
+        same &= grid.hit[:-1, own] & grid.hit[1:, other]
+        for k in (0, 1):
+            # Two runs that end at the same face say nothing of what is between them, nor do two that end openly.
+            r, c = np.nonzero(same & (ends.face[k, :-1, own] != ends.face[k, 1:, other]))
+            found.append((np.full(len(r), number), np.full(len(r), k), r, c + own.start))
+    which, side, r, c = (np.concatenate(of) for of in zip(*found, strict=True))
+    following = c + np.array(steps)[which]
+    first, second = _End(grid, table, ends, side, r, c), _End(grid, table, ends, side, r + 1, following)
+    here, there = grid.points[r, c], grid.points[r + 1, following]
+    a0, a1, b0, b1 = first.beyond(here), first.beyond(there), second.beyond(here), second.beyond(there)
+    corner = met[r, first.face, second.face]
+    wrong = ((first.face >= 0) & (a1 > THROUGH)) | ((second.face >= 0) & (b0 > THROUGH))
+    # The way from one beam to the other leaves the first's side before it comes to the second's.
+    leaves = (a1 > THROUGH) & (b0 > THROUGH) & (_zero(a0, a1) < _zero(b0, b1))
+    wrong = np.where(corner, leaves, wrong)
+    bad[which[wrong], r[wrong], c[wrong]] = True
     return bad
 
 

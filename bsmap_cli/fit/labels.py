@@ -21,6 +21,8 @@ ALIKE = ((3, 3), (7, 1))
 """Scans and beams of neighbourhoods whose misses are added up."""
 NEXT = ((-1, 0), (1, 0), (0, -2), (0, -1), (0, 1), (0, 2))
 """Scans and beams from a beam to those that its face may adopt."""
+CHUNK = 20_000
+"""Beams whose neighbourhoods are added up at a time."""
 PASSES = 30
 REACH = 12
 """Beams by which a border may move at once."""
@@ -103,18 +105,19 @@ def find_misses(
 
     known : the same for other labels, which is kept where these agree.  before : the same for fields near these ones.
     """
-    beyond = np.zeros(labels.shape) if known is None else np.where(labels >= 0, known.beyond, 0.0)
+    beyond = np.zeros(labels.size) if known is None else np.where(labels >= 0, known.beyond, 0.0).ravel()
     new = (labels >= 0) & grid.hit
     if known is not None:
         new &= labels != known.labels
-    row, column = np.nonzero(new)
+    at = np.flatnonzero(new)
     start = None
     if before is not None:
-        start = np.where(before.labels[row, column] >= 0, before.beyond[row, column], 0.0)
+        start = np.where(before.labels.ravel()[at] >= 0, before.beyond.ravel()[at], 0.0)
         start[~np.isfinite(start)] = 0.0
-    met = met_at(grid, tabulate(fields), labels[row, column], row, column, start)
-    beyond[row, column] = np.where(np.abs(met.slope) > STEEPEST, met.beyond, np.inf)
-    return Misses(labels, beyond)
+    points, directions = grid.points.reshape(-1, 3), grid.directions.reshape(-1, 3)
+    met = meet(tabulate(fields), labels.ravel()[at], points, directions, at, start)
+    beyond[at] = np.where(np.abs(met.slope) > STEEPEST, met.beyond, np.inf)
+    return Misses(labels, beyond.reshape(labels.shape))
 
 
 def without_outliers(misses: Misses, sigma: float) -> IntArray:
@@ -169,13 +172,17 @@ def _window_sums(own: IntArray, values: Array, window: tuple[int, int]) -> tuple
     """(m, n) sums of the values of beams of the same face in a window around each, and their number."""
     (m, n), reach = own.shape, (window[0] // 2, window[1] // 2)
     margins = [(r, r) for r in reach]
-    faces, padded = np.pad(own, margins, constant_values=-1), np.pad(values, margins)
+    faces, padded = np.pad(own.astype(np.int32), margins, constant_values=-1), np.pad(values, margins)
     total, count = np.zeros(own.shape), np.zeros(own.shape)
-    for i, k in itertools.product(range(window[0]), range(window[1])):
-        span = slice(i, i + m), slice(k, k + n)
-        same = faces[span] == own
-        total += np.where(same, padded[span], 0.0)
-        count += same
+    step = max(1, CHUNK // n)
+    # So many scans at once stay in the processor's cache.
+    for first in range(0, m, step):
+        rows = slice(first, min(first + step, m))
+        centre = faces[reach[0] :][rows, reach[1] : reach[1] + n]
+        for i, k in itertools.product(range(window[0]), range(window[1])):
+            same = faces[i:][rows, k : k + n] == centre
+            total[rows] += np.where(same, padded[i:][rows, k : k + n], 0.0)
+            count[rows] += same
     return total, count
 
 

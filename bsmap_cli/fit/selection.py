@@ -37,6 +37,8 @@ NEAR = 0.1
 """Standard deviations of a beam by which heights may change before the equations are made anew."""
 SETTLED = 1e-5
 """Metres of change of the heights below which a fit about its own result is not repeated."""
+CHUNK = 2048
+"""Rows of the equations that are worked on at a time."""
 MOST = 400
 """Control points of one face."""
 
@@ -159,22 +161,33 @@ def _places(u: Array) -> int:
     return int(np.count_nonzero(np.bincount(np.rint(np.clip(u, 0.0, 1.0) * 1000.0).astype(np.int64))))
 
 
-def _rows(knots: Knots, data: _Data) -> Array:
-    """(n, k) products of the basis functions, weighted."""
+def _normal_equations(knots: Knots, data: _Data) -> tuple[Array, Array]:
+    """(k, k) and (k,): products of the basis functions' products with each other, and with the heights wanted."""
     along_s, along_t = data.basis(0, knots.degree_s, knots.s), data.basis(1, knots.degree_t, knots.t)
-    return (along_s[:, :, None] * along_t[:, None, :]).reshape(len(along_s), -1)
+    A, b = np.zeros((knots.size, knots.size)), np.zeros(knots.size)
+    # So many rows at once stay in the processor's cache.
+    for part in (slice(first, first + CHUNK) for first in range(0, len(along_s), CHUNK)):
+        N = (along_s[part, :, None] * along_t[part, None, :]).reshape(-1, knots.size)
+        A += N.T @ N
+        b += data.wanted[part] @ N
+    return A, b
+
+
+def _misfit(knots: Knots, heights: Array, data: _Data) -> Array:
+    """(n,) by how much heights (k,) miss those wanted, standard deviations."""
+    along_s, along_t = data.basis(0, knots.degree_s, knots.s), data.basis(1, knots.degree_t, knots.t)
+    return np.einsum("nk,nk->n", along_s @ heights.reshape(knots.shape), along_t) - data.wanted
 
 
 def _solve(knots: Knots, data: _Data) -> _Solution:
     """Least squares on given knots."""
-    N, y = _rows(knots, data), data.wanted
-    A, b = N.T @ N, N.T @ y
+    A, b = _normal_equations(knots, data)
     information = A + smoothness(knots, data.size)
     scale = 1.0 / np.sqrt(information.diagonal())
     scaled = information * scale[:, None] * scale
     scaled.flat[:: len(A) + 1] += 1e-12
     heights = scale * np.linalg.solve(scaled, scale * b)
-    residuals = N @ heights - y
+    residuals = _misfit(knots, heights, data)
     return _Solution(knots, heights, information, float(residuals @ residuals))
 
 
@@ -209,7 +222,7 @@ _Steps = Callable[[Knots, _Data, Array], Iterator[Knots]]
 def _climb(best: _Solution, data: _Data, kinds: Sequence[_Steps]) -> _Solution:
     """The solution to which the best steps lead while they pay; those of later kinds only where no earlier one does."""
     for _ in range(MOST_STEPS):
-        misfit = (_rows(best.knots, data) @ best.heights - data.wanted) ** 2
+        misfit = _misfit(best.knots, best.heights, data) ** 2
         for steps in kinds:
             found = [_solve(knots, data) for knots in steps(best.knots, data, misfit)]
             first = min(found, key=lambda one: one.criterion, default=best)

@@ -106,11 +106,12 @@ def fit_heights(blocks: Blocks, base: Base, low: Array, high: Array, sigma: floa
     if _is_near(best, field, sigma):
         # Single steps have been tried about this very surface.
         best = _climb(best, data, (_double_steps, _fewer_steps))
-    if not _is_near(best, field, sigma):
-        field = best.on(field)
-        data = _linearise(field, blocks, sigma, data)
-        best = _climb(_solve(best.knots, data), data, (_single_steps, _double_steps, _fewer_steps))
-    return _settled(best.on(field), blocks, sigma, data)
+    if _is_near(best, field, sigma):
+        return best.fitted(field)
+    field = best.on(field)
+    data = _linearise(field, blocks, sigma, data)
+    best = _climb(_solve(best.knots, data), data, (_single_steps, _double_steps, _fewer_steps))
+    return best.fitted(field) if _is_near(best, field, sigma) else _settled(best.on(field), blocks, sigma, data)
 
 
 def _is_near(best: _Solution, field: HeightField, sigma: float) -> bool:

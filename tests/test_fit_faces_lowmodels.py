@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bsmap_cli.fit.blocks import Blocks
-from bsmap_cli.fit.lowmodels import GRAZING, axes_of, cylinder_rows, fit_cylinder_frame, fit_plane_frame, plane_rows
+from bsmap_cli.fit.lowmodels import GRAZING, axes_of, ball_rows, fit_cylinder_frame, fit_plane_frame, plane_rows
 
 
 def blocks_at(points, directions, counts):
@@ -33,7 +33,7 @@ def test_circle_is_that_of_least_squares_along_the_beams(seed):
     points = [3.0, -20.0, 0.0] + rng.uniform(0.3, 3.0) * way + 0.003 * rng.normal(size=(n, 3))
     blocks = blocks_at(points, way + 0.5 * rng.normal(size=(n, 3)), rng.integers(1, 9, n) * 1.0)
     found = fit_cylinder_frame(blocks)
-    N, data, root = cylinder_rows(found, blocks)
+    N, data, root = ball_rows(found, blocks)
     root = root * np.sqrt(blocks.counts)
     a, b, c = np.linalg.lstsq(N * root[:, None], data * root, rcond=None)[0]
     # Its weights are those of the circle before it.

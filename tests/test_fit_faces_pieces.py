@@ -6,7 +6,7 @@ from face_scenes import corridor_set
 from bsmap_cli.core.bspline import clamped_knots
 from bsmap_cli.fit.beams import make_grid
 from bsmap_cli.fit.feet import find_feet, offsets, tabulate
-from bsmap_cli.fit.heights import CylinderBase, HeightField, Knots, PlaneBase, evaluate, flat_knots, offset
+from bsmap_cli.fit.heights import Bulge, CylinderBase, HeightField, Knots, PlaneBase, evaluate, flat_knots, offset
 from bsmap_cli.fit.pieces import find_pieces
 
 
@@ -32,9 +32,10 @@ def fields():
     plane = PlaneBase(np.array([1.0, 2.0, 3.0]), np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0])
     cylinder = CylinderBase(np.array([0.5, -1.0]), 0.8, 0.3)
     leaning = cylinder._replace(upright=plane.axes)
+    sphere = leaning._replace(bulge=Bulge(0.1, 1.2))
     heights = np.array([[0.0, 0.05], [-0.04, 0.1]])
     low, high = np.array([-1.0, -1.0]), np.array([1.0, 1.0])
-    return [HeightField(base, low, high, flat_knots(), heights) for base in (plane, cylinder, leaning)]
+    return [HeightField(base, low, high, flat_knots(), heights) for base in (plane, cylinder, leaning, sphere)]
 
 
 def bent_field():
@@ -63,7 +64,9 @@ def test_feet_lie_on_the_field_and_on_their_beams():
 def test_normals_are_the_gradient_of_the_offset():
     rng = np.random.default_rng(2)
     for field in fields():
-        points = field.base.place(np.column_stack([rng.uniform(-0.9, 0.9, (20, 2)), rng.normal(scale=0.02, size=20)]))
+        st = rng.uniform(-0.9, 0.9, (20, 2))
+        height = evaluate(field, (st - field.low) / (field.high - field.low))[0]
+        points = field.base.place(np.column_stack([st, height + rng.normal(scale=0.005, size=20)]))
         value, normal = offset(field, points)
         step = 1e-6
         raised = offset(field, points + step * normal)[0]

@@ -12,7 +12,7 @@ from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.blocks import Blocks, make_blocks, single_beams, thinned
 from bsmap_cli.fit.clutter import find_planes
 from bsmap_cli.fit.crossings import find_crossings
-from bsmap_cli.fit.heights import Base, CylinderBase, HeightField, PlaneBase, plane_base
+from bsmap_cli.fit.heights import Base, Bulge, CylinderBase, HeightField, PlaneBase, plane_base
 from bsmap_cli.fit.labels import (
     Misses,
     Runs,
@@ -25,7 +25,7 @@ from bsmap_cli.fit.labels import (
     without_outliers,
     without_slipped_ends,
 )
-from bsmap_cli.fit.lowmodels import fit_cylinder_frame, fit_plane_frame, turned
+from bsmap_cli.fit.lowmodels import CylinderFrame, fit_cylinder_frame, fit_plane_frame, turned
 from bsmap_cli.fit.pieces import find_pieces
 from bsmap_cli.fit.regions import find_regions
 from bsmap_cli.fit.seeds import PAIR_BEAMS
@@ -217,19 +217,26 @@ def _refit_all(grid: BeamGrid, labels: IntArray, fields: list[HeightField], sigm
 
 
 def bases(blocks: Blocks, sigma: float) -> list[Base]:
-    """Plane, or vertical cylinder or one with another axis where that is what the blocks lie on; both where neither."""
+    """Plane, or cylinder with any axis, around a sphere, too, where that is what the blocks lie on; both where neither.
+
+    The cylinder around a sphere has an axis from which the blocks stay away.
+    """
     frame = fit_plane_frame(blocks)
     low = low_order_cost(blocks, frame, sigma)
     plane = plane_base(blocks.points, frame.axes[:, 2])
-    if low.is_round:
-        blocks = turned(blocks, low.axes)
-        found = fit_cylinder_frame(blocks)
-        if found is not None:
-            angles = np.arctan2(*(blocks.points[:, :2] - found.centre).T[::-1])
-            middle = float(np.angle(np.mean(np.exp(1j * angles))))
-            cylinder = CylinderBase(found.centre, found.radius, middle, low.axes)
-            return [cylinder, plane] if low.poor else [cylinder]
-    return [plane]
+    if not low.is_round:
+        return [plane]
+    blocks, bulge = turned(blocks, low.axes), None
+    found = fit_cylinder_frame(blocks)
+    if low.sphere is not None and low.axes is not None:
+        x, y, z = (low.sphere.centre @ low.axes).tolist()
+        found, bulge = CylinderFrame(np.array([x, y]), low.sphere.radius), Bulge(z, low.sphere.radius)
+    if found is None:
+        return [plane]
+    angles = np.arctan2(*(blocks.points[:, :2] - found.centre).T[::-1])
+    middle = float(np.angle(np.mean(np.exp(1j * angles))))
+    cylinder = CylinderBase(found.centre, found.radius, middle, low.axes, bulge)
+    return [cylinder, plane] if low.poor else [cylinder]
 
 
 def _rectangle(grid: BeamGrid, member: NDArray[np.bool_], base: Base) -> tuple[Array, Array]:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bsmap_cli.core.pieces import CHUNK, Spans, horner
-from bsmap_cli.fit.heights import CylinderBase, HeightField
+from bsmap_cli.fit.heights import CylinderBase, HeightField, bulge_of, bulge_over
 from bsmap_cli.model import Array, IntArray
 
 SETTLED = 1e-5
@@ -58,7 +58,9 @@ class Table(NamedTuple):
     """Height fields of f faces.
 
     frame : (12, f) axes s, t, normal and origin; of a cylinder, two across the axis, the axis and a point of it.
-    radius, middle : (f,) of cylinders; radius 0 for planes.  low, size : (2, f) of the rectangles, metres.
+    radius, middle : (f,) of cylinders; radius 0 for planes.
+    bulge : (2, f) t of the centre and radius of the spheres that heights begin from; radius 0 where there is none.
+    low, size : (2, f) of the rectangles, metres.
     least, most : (f,) parameters beyond which a surface goes on straight.  lines : along s and t.
     orders : (2, f) of the coefficients along t and s.
     coefficients : (4, 4, pieces) Taylor coefficients about the middles, those of t outside.  first_piece : (f,).
@@ -67,6 +69,7 @@ class Table(NamedTuple):
     frame: Array
     radius: Array
     middle: Array
+    bulge: Array
     low: Array
     size: Array
     least: Array
@@ -85,6 +88,7 @@ def tabulate(fields: Sequence[HeightField]) -> Table:
 @lru_cache(maxsize=16)
 def _tabulated(fields: tuple[HeightField, ...]) -> Table:
     frame, radius, middle = np.empty((12, len(fields))), np.zeros(len(fields)), np.zeros(len(fields))
+    bulge = np.array([bulge_of(field.base) or (0.0, 0.0) for field in fields]).reshape(-1, 2).T
     for k, field in enumerate(fields):
         base = field.base
         if isinstance(base, CylinderBase):
@@ -106,7 +110,9 @@ def _tabulated(fields: tuple[HeightField, ...]) -> Table:
     for p, start, count in zip(pieces, first, total, strict=True):
         q, r = p.coefficients.shape[:2]
         coefficients[:q, :r, start : start + count] = p.coefficients[:, :, 0]
-    return Table(frame, radius, middle, low, high - low, least, most, (along_s, along_t), orders, coefficients, first)
+    return Table(
+        frame, radius, middle, bulge, low, high - low, least, most, (along_s, along_t), orders, coefficients, first
+    )
 
 
 def _joined(spans: Sequence[Spans]) -> Lines:
@@ -303,7 +309,14 @@ def _heights(table: Table, face: IntArray, local: Array) -> tuple[Array, Array, 
     value, by_x, by_y = horner(table.coefficients[:orders_t, :orders_s].take(piece, axis=2), *x)
     gradient = np.stack([by_x * scale[0], by_y * scale[1]])
     height = value + gradient[0] * (uv[0] - inside[0]) + gradient[1] * (uv[1] - inside[1])
-    return height, gradient / size, uv
+    gradient /= size
+    if table.bulge.any():
+        middle, radius = np.broadcast_to(table.bulge.take(face, axis=1), uv.shape)
+        at = np.flatnonzero(radius)
+        more, slope = bulge_over(radius[at], local[1, at] - middle[at])
+        height[at] += more
+        gradient[1, at] += slope
+    return height, gradient, uv
 
 
 def _own_parameter(line: Lines, face: IntArray, u: Array) -> tuple[IntArray, Array, Array]:

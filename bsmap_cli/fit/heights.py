@@ -15,6 +15,9 @@ from bsmap_cli.core.pieces import Pieces, evaluate_pieces, polynomial_pieces
 from bsmap_cli.fit.lowmodels import axes_of
 from bsmap_cli.model import Array
 
+POLAR = 0.98
+"""Sine of the latitude to which heights follow a sphere over the cylinder around it."""
+
 
 def _turned(vectors: Array, axes: Array) -> Array:
     """Vectors (..., 3) in axes (3, 3); of a plain list, columns in one piece: long operations on them are quick."""
@@ -46,16 +49,37 @@ class PlaneBase(NamedTuple):
         return self.origin + local @ self.axes.T
 
 
+class Bulge(NamedTuple):
+    """A sphere over the cylinder around it: t of its centre and its radius, metres."""
+
+    middle: float
+    radius: float
+
+    def over(self, t: Array) -> tuple[Array, Array]:
+        """Heights (n,) at t (n,) and their slopes; near the poles and beyond, the sphere goes on straight."""
+        return bulge_over(self.radius, t - self.middle)
+
+
+def bulge_over(radius: Array | float, way: Array) -> tuple[Array, Array]:
+    """Heights (n,) of spheres over the cylinders around them and their slopes, `way` (n,) along the axis."""
+    inside = np.clip(way, -POLAR * radius, POLAR * radius)
+    level = np.sqrt(radius**2 - inside**2)
+    slope = -inside / level
+    return level - radius + slope * (way - inside), slope
+
+
 class CylinderBase(NamedTuple):
     """Cylinder: s is the arc's length from the angle `middle`, t the way along the axis, h the distance outwards.
 
     upright : (3, 3) columns x, y and along the axis, of the frame in which the cylinder is vertical; None: that is map.
+    bulge : of the sphere that the cylinder goes around; heights of a field are then those beyond the sphere.
     """
 
     centre: Array
     radius: float
     middle: float
     upright: Array | None = None
+    bulge: Bulge | None = None
 
     def local(self, points: Array) -> Array:
         points = self._own(points)
@@ -88,6 +112,11 @@ class CylinderBase(NamedTuple):
 Base = PlaneBase | CylinderBase
 
 
+def bulge_of(base: Base) -> Bulge | None:
+    """The sphere that the heights of a field begin from, if it is one."""
+    return None if isinstance(base, PlaneBase) else base.bulge
+
+
 class Knots(NamedTuple):
     """Degrees and clamped knots on [0, 1] of a height field."""
 
@@ -117,18 +146,22 @@ def least_knots(base: Base, low: Array, high: Array) -> Knots:
 
     A plane's offset and slopes are those of a bilinear surface. A cylinder's radius and centre are heights that go like
     1, sine and cosine around it: without a second degree, and a span for each half turn, the covariance would know
-    nothing of the last.
+    nothing of the last. Of a sphere they are curves along the axis, too.
     """
     flat = flat_knots()
     if isinstance(base, PlaneBase):
         return flat
     spans = int(np.ceil((high[0] - low[0]) / (np.pi * base.radius)))
-    return flat._replace(degree_s=2, s=clamped_knots(2, np.arange(1, spans) / spans))
+    around = flat._replace(degree_s=2, s=clamped_knots(2, np.arange(1, spans) / spans))
+    return around if base.bulge is None else around._replace(degree_t=2, t=open_knots(2))
 
 
 @dataclass(frozen=True, eq=False)
 class HeightField:
-    """Heights over a base on the rectangle from `low` (2,) to `high` (2,) in s and t, metres; heights (ns, nt)."""
+    """Heights over a base on the rectangle from `low` (2,) to `high` (2,) in s and t, metres; heights (ns, nt).
+
+    Where the base bulges, they are told from the bulge on.
+    """
 
     base: Base
     low: Array
@@ -149,8 +182,15 @@ class HeightField:
 
 def evaluate(field: HeightField, uv: Array) -> tuple[Array, Array]:
     """Heights (n,) and their gradients (n, 2) by s and t; beyond the rectangle the surface goes on straight."""
-    if field.knots.shape == (2, 2):
-        return _bilinear(field, uv)
+    height, gradient = _bilinear(field, uv) if field.knots.shape == (2, 2) else _spline(field, uv)
+    bulge = bulge_of(field.base)
+    if bulge is not None:
+        more, slope = bulge.over(field.low[1] + uv[:, 1] * (field.high[1] - field.low[1]))
+        height, gradient[:, 1] = height + more, gradient[:, 1] + slope
+    return height, gradient
+
+
+def _spline(field: HeightField, uv: Array) -> tuple[Array, Array]:
     inside = np.clip(uv, 0.0, 1.0)
     value, by_u, by_v = evaluate_pieces(field.pieces, inside[:, 0], inside[:, 1], 1)[:, 0]
     height = value + by_u * (uv[:, 0] - inside[:, 0]) + by_v * (uv[:, 1] - inside[:, 1])

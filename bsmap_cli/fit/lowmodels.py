@@ -1,6 +1,6 @@
-"""Surfaces of low order for growing regions: polynomial heights over a plane, and vertical cylinders.
+"""Surfaces of low order for growing regions: polynomial heights over a plane, vertical cylinders, and spheres.
 
-Both are linear in their unknowns, so that a region is held by sums (A, b, s): chi square of unknowns x is
+All are linear in their unknowns, so that a region is held by sums (A, b, s): chi square of unknowns x is
 x'A x - 2 b'x + s, and adding data is adding sums.
 """
 
@@ -30,8 +30,11 @@ GAINS = 0.05, 1e-3
 ENOUGH_BLOCKS = 300, 1500
 """Evenly taken, to tell directions apart and for the best of them: heights over the base make up for what the axis
 misses."""
-LEAST_RADIUS, LARGEST_RADIUS = 0.05, 5.0
-"""Metres, of cylinders."""
+LEAST_RADIUS, LARGEST_RADIUS, LARGEST_SPHERE = 0.05, 5.0, 20.0
+"""Metres, of cylinders and spheres: what is wider is a polynomial."""
+SPHERE_STEPS = 4
+POLAR = 0.95
+"""Sine of the latitude to which heights over the cylinder around a sphere are told."""
 UNTOLD = 1e-12
 """Share of its own square by which an unknown that the rows do not tell is held near 0."""
 
@@ -61,7 +64,14 @@ class CylinderFrame(NamedTuple):
     radius: float
 
 
-Frame = PlaneFrame | CylinderFrame
+class SphereFrame(NamedTuple):
+    """Sphere about which the equation is made linear: centre (3,) in map, radius metres."""
+
+    centre: Array
+    radius: float
+
+
+Frame = PlaneFrame | CylinderFrame | SphereFrame
 
 
 def chi_squares(sums: Sums, sizes: Sequence[int]) -> Array:
@@ -98,18 +108,21 @@ def plane_rows(frame: PlaneFrame, blocks: Blocks, size: int = ORDERS[-1]) -> tup
     return polynomials(local[:, 0], local[:, 1], size), local[:, 2], 1.0 / sine
 
 
-def cylinder_rows(frame: CylinderFrame, blocks: Blocks) -> tuple[Array, Array, Array]:
-    """Rows of x^2 + y^2 = 2 a x + 2 b y + c about the frame's centre, their data, and weights' roots."""
-    xy = blocks.points[:, :2] - frame.centre
-    rows = np.column_stack([2.0 * xy, np.ones(len(xy))])
-    along = np.abs(np.einsum("nk,nk->n", xy, blocks.directions[:, :2]))
-    return rows, np.sum(xy * xy, axis=1), 1.0 / (2.0 * np.maximum(along, 2.0 * GRAZING * frame.radius))
+def ball_rows(frame: CylinderFrame | SphereFrame, blocks: Blocks) -> tuple[Array, Array, Array]:
+    """Rows of p^2 = 2 c p + d about the frame's centre, of p = (x, y) or (x, y, z), their data, and weights' roots."""
+    size = len(frame.centre)
+    p = blocks.points[:, :size] - frame.centre
+    rows = np.column_stack([2.0 * p, np.ones(len(p))])
+    along = np.abs(np.einsum("nk,nk->n", p, blocks.directions[:, :size]))
+    return rows, np.sum(p * p, axis=1), 1.0 / (2.0 * np.maximum(along, 2.0 * GRAZING * frame.radius))
 
 
 def weighted_rows(frame: Frame, blocks: Blocks, sigma: float) -> tuple[Array, Array]:
     """Rows (n, k) and data (n,) of blocks in standard deviations."""
-    rows = plane_rows(frame, blocks) if isinstance(frame, PlaneFrame) else cylinder_rows(frame, blocks)
-    N, data, root = rows
+    if isinstance(frame, PlaneFrame):
+        N, data, root = plane_rows(frame, blocks)
+    else:
+        N, data, root = ball_rows(frame, blocks)
     root = root * np.sqrt(blocks.counts) / sigma
     return N * root[:, None], data * root
 
@@ -200,6 +213,28 @@ def _circles(points: Array, directions: Array, counts: Array, steps: int) -> _Ci
         good &= (square > LEAST_RADIUS**2) & (square < LARGEST_RADIUS**2)
         radius = np.sqrt(np.clip(square, LEAST_RADIUS**2, LARGEST_RADIUS**2))
     return _Circles(middle + centre, radius, good)
+
+
+def fit_sphere_frame(blocks: Blocks) -> SphereFrame | None:
+    """Sphere through blocks; None where they lie on none."""
+    frame, root = SphereFrame(np.average(blocks.points, axis=0, weights=blocks.counts), 1.0), np.sqrt(blocks.counts)
+    # How the beams cross it is known once there is a sphere.
+    for step in range(SPHERE_STEPS):
+        N, data, by_angle = ball_rows(frame, blocks)
+        weight = root * by_angle if step else root
+        *c, d = np.linalg.lstsq(N * weight[:, None], data * weight, rcond=1e-9)[0].tolist()
+        square = d + float(np.dot(c, c))
+        if not LEAST_RADIUS**2 < square < LARGEST_SPHERE**2:
+            return None
+        frame = SphereFrame(frame.centre + np.array(c), float(np.sqrt(square)))
+    return frame
+
+
+def sphere_axes(blocks: Blocks, frame: SphereFrame) -> Array | None:
+    """Frame (3, 3) whose third column is the axis from which blocks on a sphere stay away; None where there is none."""
+    n = (blocks.points - frame.centre) / frame.radius
+    axis = np.linalg.eigh((n * blocks.counts[:, None]).T @ n)[1][:, 0]
+    return axes_of(axis) if np.abs(n @ axis).max() < POLAR else None
 
 
 def turned(blocks: Blocks, axes: Array | None) -> Blocks:

@@ -14,6 +14,7 @@ from bsmap_cli.fit.heights import (
     Base,
     HeightField,
     Knots,
+    bulge_of,
     least_knots,
     with_degree,
     with_knot,
@@ -146,6 +147,9 @@ def _linearise(field: HeightField, blocks: Blocks, sigma: float, near: _Data | N
     start = None if near is None else near.feet.beyond
     feet = meet(tabulate([field]), only, blocks.points, blocks.directions, start=start)
     wanted = feet.height - feet.slope * feet.beyond
+    bulge = bulge_of(field.base)
+    if bulge is not None:
+        wanted -= bulge.over(field.low[1] + feet.uv[:, 1] * (field.high[1] - field.low[1]))[0]
     root = np.sqrt(blocks.counts) / sigma
     size = np.abs(feet.beyond) * root
     # What does not fit yet is no outlier: the scale is that of the residuals.

@@ -10,11 +10,14 @@ from bsmap_cli.fit.context import PRICE, Context
 from bsmap_cli.fit.lowmodels import (
     ORDERS,
     PlaneFrame,
+    SphereFrame,
     Sums,
     chi_squares,
     fit_axis,
     fit_cylinder_frame,
     fit_plane_frame,
+    fit_sphere_frame,
+    sphere_axes,
     sums_of,
     turned,
 )
@@ -24,6 +27,8 @@ NEAR = 1.5
 """Metres between the boxes of two regions that may be one face."""
 FAR = 2.0
 """Times the criterion of two regions apart, beyond which that of both as one need not be known exactly."""
+DOME = 50
+"""Blocks of a surface that may be a sphere: fewer lie on one by chance."""
 VAULT = 200
 """Blocks of a surface that may be a cylinder with any axis: clutter lies on many, and to look for them takes time."""
 
@@ -75,6 +80,7 @@ class LowOrder(NamedTuple):
     """Least criterion of a low-order surface; whether that is a cylinder, and its frame where it is not vertical.
 
     bent : whether a plane would not do.  poor : whether no surface of low order would.
+    sphere : where it is one; then the cylinder around it has that frame.
     """
 
     cost: float
@@ -82,12 +88,13 @@ class LowOrder(NamedTuple):
     bent: bool
     poor: bool
     axes: Array | None = None
+    sphere: SphereFrame | None = None
 
 
 def low_order_cost(blocks: Blocks, frame: PlaneFrame, sigma: float) -> LowOrder:
     """Least criterion over all orders, and over a vertical cylinder where the plane's polynomials are poor.
 
-    A cylinder with any axis is tried where all these are: what is nearly flat lies on many cylinders.
+    A sphere, and a cylinder with any axis, are tried where all these are: what is nearly flat lies on many.
     """
     return _low_order_cost(blocks, sums_of(frame, blocks, sigma), sigma)
 
@@ -102,6 +109,10 @@ def _low_order_cost(blocks: Blocks, sums: Sums, sigma: float) -> LowOrder:
         by_circle = _cost_of_cylinder(blocks, None, sigma)
         if by_circle < found.cost:
             found = LowOrder(by_circle, True, True, by_circle > poor)
+    if best > 0 and found.cost > poor and len(blocks.counts) >= DOME and (ball := fit_sphere_frame(blocks)) is not None:
+        by_sphere = float(chi_squares(sums_of(ball, blocks, sigma), (4,))[0]) + 5 * PRICE
+        if by_sphere < found.cost and (axes := sphere_axes(blocks, ball)) is not None:
+            found = LowOrder(by_sphere, True, True, by_sphere > poor, axes, ball)
     if best > 0 and found.cost > poor and len(blocks.counts) >= VAULT and (axes := fit_axis(blocks)) is not None:
         by_circle = _cost_of_cylinder(blocks, axes, sigma) + 2 * PRICE
         if by_circle < found.cost:

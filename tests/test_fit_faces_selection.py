@@ -5,8 +5,8 @@ import pytest
 
 from bsmap_cli.core.bspline import clamped_knots, inner_knots, open_knots
 from bsmap_cli.fit.blocks import Blocks
-from bsmap_cli.fit.heights import CylinderBase, HeightField, Knots, PlaneBase, least_knots
-from bsmap_cli.fit.selection import PRICE, fit_heights, refit
+from bsmap_cli.fit.heights import CylinderBase, HeightField, Knots, PlaneBase, basis_matrix, evaluate, least_knots
+from bsmap_cli.fit.selection import PRICE, fit_heights, refit, told
 
 SIGMA = 0.01
 PLANE = PlaneBase(np.zeros(3), np.eye(3))
@@ -75,3 +75,32 @@ def test_fewer_knots_are_never_the_worse_choice():
         chosen = fit_heights(blocks, PLANE, LOW, HIGH, SIGMA)
         again = refit(chosen.field, blocks, SIGMA, fewer=True)
         assert again.criterion > chosen.criterion - PRICE
+
+
+def test_the_least_surface_tells_all_it_knows_and_others_less():
+    flat = least_knots(PLANE, LOW, HIGH)
+    assert told(flat, flat) == 1.0
+    shares = [told(Knots(2, 1, clamped_knots(2, np.arange(1, n) / n), open_knots(1)), flat) for n in (1, 2, 4, 8)]
+    left_out = np.array([6, 7, 9, 13]) * PRICE / 3.0
+    np.testing.assert_allclose(shares, [n / (n + more) for n, more in zip((6, 8, 12, 20), left_out, strict=True)])
+    assert fit_heights(blocks_of(lambda s, t: 0.1 * s), PLANE, LOW, HIGH, SIGMA).field.knots.size == 4
+
+
+def test_covariance_of_bent_faces_holds_their_errors():
+    rng = np.random.default_rng(1)
+    inside = []
+    for seed in range(40):
+        # Bends from hardly seen to well seen.
+        high, wide, phase = 0.02 * 10.0 ** rng.uniform(-0.7, 0.7), rng.uniform(0.5, 2.0), rng.uniform(0.0, 6.0)
+        height = lambda s, t: high * np.sin(wide * s + phase) * np.cos(0.7 * wide * t)  # noqa: B023, E731
+        blocks = blocks_of(height, seed)
+        fitted = fit_heights(blocks, PLANE, LOW, HIGH, SIGMA)
+        if fitted.field.knots.size == 4:
+            continue
+        uv = (blocks.points[:, :2] - LOW) / (HIGH - LOW)
+        error = evaluate(fitted.field, uv)[0] - height(*blocks.points[:, :2].T)
+        N = basis_matrix(fitted.field.knots, uv)
+        variance = np.sum((N @ np.linalg.inv(fitted.information)) * N, axis=1)
+        inside.append(np.mean(error**2 < 3.84 * variance))
+    assert len(inside) > 20
+    assert 0.91 < np.mean(inside) < 0.98

@@ -305,3 +305,19 @@ def test_gap_beside_a_ragged_outline_is_closed_without_a_spike():
     whole = united(regions, 0.1)
     assert whole.bounds[3] < -0.043
     assert whole.area > sum(regions[k].area for k in (0, 1))
+
+
+def test_joined_face_does_not_swing_between_what_planes_tell_of_it():
+    """One of three data sets bends by 3 cm in its last 10 cm; the others saw a plane there."""
+    flat = [wall(f"{name}/1", 0.0, 4.0) for name in "ab"]
+    P, knots = flat[0].control_points, np.array([0.0, 0.0, 0.95, 1.0, 1.0])
+    bent = replace(
+        wall("c/1", 0.0, 4.0),
+        knots_u=knots,
+        control_points=np.stack([P[0], 0.05 * P[0] + 0.95 * P[1], P[1] + [0.0, 0.03, 0.0]]),
+        covariance=replace(flat[0].covariance, matrix=SIGMA**2 * np.eye(6)),
+    )
+    result = merged(*flat, bent)
+    at = np.stack(np.meshgrid(np.linspace(0.0, 1.0, 201), [0.1, 0.5, 0.9], indexing="ij"), axis=-1).reshape(-1, 2)
+    for surface in result.surfaces:
+        assert np.abs(evaluate_surface(surface, *at.T)[:, 1]).max() < 0.005

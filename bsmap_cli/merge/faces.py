@@ -13,7 +13,7 @@ from bsmap_cli.merge.bases import BasedFace, based_face, has_base
 from bsmap_cli.merge.changes import MOVED, find_changes
 from bsmap_cli.merge.denial import denied_faces
 from bsmap_cli.merge.frames import common_frame
-from bsmap_cli.merge.information import join, tell
+from bsmap_cli.merge.information import finest_spans, join, tell
 from bsmap_cli.model import Array, BSplineSurface, Crease, Decision
 from bsmap_cli.params import MergeParams
 from bsmap_cli.track import Track, silent
@@ -112,6 +112,7 @@ def _groups(faces: Sequence[BasedFace], numbers: Sequence[Sequence[int]], params
             out.append(Group(some, None, [], None))
             continue
         frame = common_frame(some)
-        told = [tell(face, frame, params.flatness) for face in some]
-        out.append(Group(some, frame, told, join(told, frame)))
+        finest = finest_spans(some, frame)
+        told = [tell(face, frame, params.flatness, finest) for face in some]
+        out.append(Group(some, frame, told, join(told, frame, finest)))
     return out

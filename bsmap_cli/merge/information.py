@@ -42,6 +42,8 @@ WAVE = 1.0
 """Metres over which a wall's departure from its spline is correlated."""
 PER_CONTROL_POINT = 4
 """Samples for each control point and direction, through which heights are carried over to the common base."""
+PER_SPAN, MOST_SAMPLES = 2, 64
+"""Samples for each of the narrowest spans and direction, but no more than so many for the sake of these."""
 ROBUST = 3.0
 """Standard deviations beyond which a data set's heights count less (Huber)."""
 
@@ -96,11 +98,16 @@ class Joined(NamedTuple):
     criterion: float
 
 
-def tell(face: BasedFace, frame: Frame, flatness: float) -> Told:
-    """Carry a face's heights and their covariance over to the common base, by least squares on samples."""
+def tell(face: BasedFace, frame: Frame, flatness: float, finest: Array) -> Told:
+    """Carry a face's heights and their covariance over to the common base, by least squares on samples.
+
+    finest : (2,) metres along s and t of the frame, of the narrowest spans that the joined face may have.
+    """
     field, covariance = face.field, face.surface.covariance
     assert isinstance(covariance, HeightCovariance)
-    grid = _grid(field.knots)
+    axes = _axes(field, frame)
+    spans = (field.high - field.low) / (finest[axes] if axes else finest.min())
+    grid = _grid(field.knots, spans)
     places = places_on(field, grid)
     local = frame.base.local(places)
     n = normals(frame.base, places)
@@ -114,9 +121,33 @@ def tell(face: BasedFace, frame: Frame, flatness: float) -> Told:
     uv = (local[:, :2] - frame.low) / (frame.high - frame.low)
     all_poses = np.concatenate(by_pose, axis=1) if by_pose else np.zeros((len(C), 0))
     degrees, inner = _knots_in(field, frame)
-    stiffness = float(np.sqrt(basis.shape[1] / basis.shape[0])) / flatness
+    # What it saw nothing of counts once for each of its heights, but no less than once for each of the spans.
+    seen = max(basis.shape[1], np.prod(np.clip(spans, 1.0, MOST_SAMPLES / PER_SPAN)))
+    stiffness = float(np.sqrt(seen / basis.shape[0])) / flatness
     heights = carry @ local[:, 2]
     return Told(uv, carry, heights, root, sensor_root, C, all_poses, covariance.pose, basis, stiffness, degrees, inner)
+
+
+def finest_spans(faces: Sequence[BasedFace], frame: Frame) -> Array:
+    """(2,) metres along s and t of a frame, of the narrowest spans that faces tell of: half as wide as theirs are.
+
+    What is narrower lies between what they tell, and could be anything.
+    """
+    spans = []
+    for face in faces:
+        k, size = face.field.knots, face.field.high - face.field.low
+        own = size * [np.diff(np.unique(k.s)).min(), np.diff(np.unique(k.t)).min()]
+        axes = _axes(face.field, frame)
+        spans.append(own[axes] if axes else np.full(2, own.min()))
+    return np.asarray(np.min(spans, axis=0)) / 2.0
+
+
+def _axes(field: HeightField, frame: Frame) -> list[int]:
+    """Which of a field's axes lies along s and which along t of a frame; none where they are skew to them."""
+    if not (isinstance(frame.base, PlaneBase) and isinstance(field.base, PlaneBase)):
+        return [0, 1]
+    turn = np.abs(frame.base.axes[:, 0] @ field.base.axes[:, :2])
+    return [0, 1] if turn[0] > ALIGNED else [1, 0] if turn[1] > ALIGNED else []
 
 
 def _free_heights(covariance: Array) -> tuple[Array, Array]:
@@ -141,14 +172,11 @@ def _inverse_root(covariance: Array) -> Array:
 
 def _knots_in(field: HeightField, frame: Frame) -> tuple[tuple[int, int], tuple[Array, Array]]:
     """Degrees and knots of a face along the frame's axes; none where its own are skew to them, or follow an arc."""
-    k = field.knots
+    k, axes = field.knots, _axes(field, frame)
     degrees, inner = [1, 1], [np.zeros(0), np.zeros(0)]
-    if k.size > 4 and isinstance(frame.base, PlaneBase) and isinstance(field.base, PlaneBase):
-        turn = frame.base.axes[:, 0] @ field.base.axes[:, :2]
+    if k.size > 4 and axes and isinstance(frame.base, PlaneBase) and isinstance(field.base, PlaneBase):
         for own, (degree, knots) in enumerate(((k.degree_s, k.s), (k.degree_t, k.t))):
-            axis = 0 if abs(turn[own]) > ALIGNED else 1
-            if axis == 1 and abs(turn[1 - own]) < ALIGNED:
-                continue
+            axis = axes.index(own)
             at = np.full((len(np.unique(knots)), 3), 0.0)
             at[:, own] = np.unique(knots) * field.high[own]
             local = frame.base.local(field.base.place(at))[:, :2]
@@ -172,22 +200,25 @@ def unit_errors(part: PosePart) -> Array:
     return own if part.modes is None else np.concatenate([own, part.modes], axis=1)
 
 
-def join(told: Sequence[Told], frame: Frame) -> Joined:
+def join(told: Sequence[Told], frame: Frame, finest: Array) -> Joined:
     """Joined heights on the knots that the data pay for, found step by step from the least surface.
 
     Where that does not end in a good fit, it is tried from the knots of all faces told, too.
+
+    finest : (2,) metres along s and t, of the narrowest spans.
     """
-    best = _improved(told, frame, least_knots(frame.base, frame.low, frame.high))
+    least = np.maximum(finest / (frame.high - frame.low), LEAST_SPAN)
+    best = _improved(told, frame, least_knots(frame.base, frame.low, frame.high), least)
     own = _own_knots(told)
     if own.size > 4 and best.criterion > ENOUGH * sum(len(one.heights) for one in told):
-        best = min(best, _improved(told, frame, own), key=lambda j: j.criterion)
+        best = min(best, _improved(told, frame, own, least), key=lambda j: j.criterion)
     return best
 
 
-def _improved(told: Sequence[Told], frame: Frame, knots: Knots) -> Joined:
+def _improved(told: Sequence[Told], frame: Frame, knots: Knots, least: Array) -> Joined:
     best = solve(told, frame, knots)
     for _ in range(40):
-        tried = [solve(told, frame, richer) for richer in _richer(best.field.knots)]
+        tried = [solve(told, frame, richer) for richer in _richer(best.field.knots, least)]
         better = min(tried, key=lambda j: j.criterion, default=best)
         if better.criterion >= best.criterion:
             break
@@ -211,8 +242,8 @@ def _spaced(inner: Array) -> Array:
     return np.array(kept)
 
 
-def _richer(k: Knots) -> list[Knots]:
-    """One step richer: a degree more, or one span halved."""
+def _richer(k: Knots, least: Array) -> list[Knots]:
+    """One step richer: a degree more, or one span halved that is wide enough; least : (2,) of the whole."""
     if k.size >= MOST:
         return []
     out = []
@@ -220,15 +251,15 @@ def _richer(k: Knots) -> list[Knots]:
         out.append(k._replace(degree_s=k.degree_s + 1, s=with_degree(k.s, k.degree_s)))
     if k.degree_t < HIGHEST_DEGREE:
         out.append(k._replace(degree_t=k.degree_t + 1, t=with_degree(k.t, k.degree_t)))
-    out += [k._replace(s=with_knot(k.s, k.degree_s, new)) for new in _middles(k.s)]
-    out += [k._replace(t=with_knot(k.t, k.degree_t, new)) for new in _middles(k.t)]
+    out += [k._replace(s=with_knot(k.s, k.degree_s, new)) for new in _middles(k.s, least[0])]
+    out += [k._replace(t=with_knot(k.t, k.degree_t, new)) for new in _middles(k.t, least[1])]
     return out
 
 
-def _middles(knots: Array) -> list[float]:
+def _middles(knots: Array, least: float) -> list[float]:
     """Middles of the spans that are wide enough to be halved."""
     edges = np.unique(knots)
-    return [float((a + b) / 2.0) for a, b in pairwise(edges) if b - a > 2.0 * LEAST_SPAN]
+    return [float((a + b) / 2.0) for a, b in pairwise(edges) if b - a >= 2.0 * least]
 
 
 def solve(told: Sequence[Told], frame: Frame, knots: Knots) -> Joined:
@@ -281,6 +312,8 @@ def covariance_of(joined: Joined, told: Sequence[Told]) -> tuple[Array, tuple[Po
     return (matrix + matrix.T) / 2.0, tuple(parts[name] for name in sorted(parts))
 
 
-def _grid(knots: Knots) -> Array:
-    u, v = (np.linspace(0.0, 1.0, PER_CONTROL_POINT * n) for n in knots.shape)
+def _grid(knots: Knots, spans: Array) -> Array:
+    """(n, 2) parameters of samples; spans : (2,) how many of the narrowest spans there are along u and v."""
+    counts = np.maximum(PER_CONTROL_POINT * np.array(knots.shape), np.minimum(PER_SPAN * spans, MOST_SAMPLES))
+    u, v = (np.linspace(0.0, 1.0, int(np.ceil(count))) for count in counts)
     return np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2)

@@ -91,3 +91,15 @@ def test_order_of_the_faces_does_not_matter():
     for a, b in zip(one.surfaces, other.surfaces, strict=True):
         assert a.name == b.name
         np.testing.assert_allclose(a.control_points, b.control_points, atol=1e-9)
+
+
+def test_thin_sheet_on_a_wall_is_there_once_though_one_data_set_saw_the_wall_through_it():
+    """1.5 cm before the wall; its scans left it out, and the wall between them was taken for seen."""
+    hole = [((1.0, 0.5), (2.0, 1.5))]
+    around = [wall(f"{name}/1", 0.0, 4.0, pose=POSE, holes=hole) for name in "ab"]
+    sheets = [wall(f"{name}/2", 1.0, 2.0, heights=(0.5, 1.5), offset=0.015, pose=POSE) for name in "ab"]
+    result = merged(map_of(*around, *sheets, wall("c/1", 0.0, 4.0, pose=POSE)))
+    large, small = sorted(result.surfaces, key=lambda surface: -based_face(surface).area)
+    assert based_face(large).area == pytest.approx(9.0, abs=0.01)
+    assert based_face(small).area == pytest.approx(1.0, abs=0.01)
+    assert np.abs(small.control_points[..., 1] - 0.015).max() < 0.001

@@ -1,8 +1,10 @@
 """Round walls and pillars of several data sets become one face, as flat ones do."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from face_maps import map_of
+from face_maps import SIGMA, bowed, map_of, wall
 from round_maps import arc, floor_around
 from test_merge_topology import check_creases
 
@@ -12,6 +14,7 @@ from bsmap_cli.export.tessellation import tessellate_map
 from bsmap_cli.fit.heights import evaluate
 from bsmap_cli.merge import merge_surfaces
 from bsmap_cli.merge.bases import based_face, field_of
+from bsmap_cli.model import Crease, TrimLoop
 from bsmap_cli.params import MergeParams
 
 INSIDE = (0.0, 0.0)
@@ -109,3 +112,24 @@ def test_field_over_a_cylinder_is_that_of_its_surface():
     uv = np.random.default_rng(0).uniform(size=(200, 2))
     local = field.base.local(evaluate_surface(surface, *uv.T))
     assert np.abs(local[:, 2] - evaluate(field, field.parameters(local))[0]).max() < 2e-4
+
+
+@pytest.mark.parametrize("bow", [0.0, 0.03, 0.08])
+def test_half_pillar_and_the_bent_wall_beside_it_share_their_crease(bow):
+    """Both are curved, and three data sets saw both."""
+    rng, faces, creases = np.random.default_rng(1), [], []
+    for number, name in enumerate("abc"):
+        pillar = arc(f"{name}/1", 0.3, 0.0, np.pi, sensor=(0.5, 2.0), rng=rng, marks=(-1, -1, -1, number))
+        flat = wall(f"{name}/2", 0.3, 4.3, noise=rng.normal(0.0, SIGMA, (2, 2)))
+        side = bowed(flat, bow) if bow else flat
+        side = replace(side, trims=(TrimLoop(side.trims[0].parameters, np.array([-1, -1, -1, number])),))
+        faces += [pillar, side]
+        creases.append(Crease((pillar.name, side.name), np.array([[0.3, 0.0, 0.0], [0.3, 0.0, 2.5]])))
+    result = merge_surfaces([map_of(*faces, creases=creases)], MergeParams())
+    assert len(result.surfaces) == 2
+    (crease,) = result.creases
+    np.testing.assert_allclose(crease.points[[0, -1]], [[0.3, 0.0, 0.0], [0.3, 0.0, 2.5]], atol=0.002)
+    meshes = tessellate_map(result, 0.002)
+    shared = [{tuple(v) for v in mesh.vertices if np.abs(v[:2] - [0.3, 0.0]).max() < 0.003} for mesh in meshes]
+    assert shared[0] == shared[1]
+    assert len(shared[0]) >= 2

@@ -114,6 +114,19 @@ def test_survey_of_another_place_keeps_its_data_sets():
     assert [d.name for d in result.data_sets] == ["set-01", "set-02", "2.set-01", "2.set-02"]
 
 
+def test_small_face_that_one_survey_saw_alone_does_not_keep_its_data_set_apart():
+    """After four surveys the others have a fifth of a weight in each face, and it has all of that of its own."""
+    rng = np.random.default_rng(4)
+    old = folded([survey(rng, cupboard=0.5) for _ in range(4)])
+    new = survey(rng, cupboard=0.5)
+    alone = wall("set-02/09", 9.0, 9.2, heights=(0.0, 0.3), pose=POSE)
+    pose = next(s.covariance.pose for s in new.surfaces if s.name == "set-02/03")
+    alone = replace(alone, covariance=replace(alone.covariance, pose=pose))
+    result = merge_surfaces([old, map_of(*new.surfaces, alone)], MergeParams())
+    assert len(result.surfaces) == 4
+    assert [d.name for d in result.data_sets] == ["set-01", "set-02"]
+
+
 def test_old_map_and_new_survey_may_be_given_in_any_order():
     rng = np.random.default_rng(2)
     old, new = folded([survey(rng)]), survey(rng)

@@ -17,6 +17,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from bsmap_cli.core.modes import LEAST_SHARE, LEVER, MOST_MODES, largest_positive
@@ -25,8 +26,10 @@ from bsmap_cli.model import Array, BSplineSurface, DataSet, PosePart
 NEAR = 1.0
 """Metres between the centres of data sets that are summed up, at most."""
 ALIKE = 0.7
-"""Least likeness of the weights with which two data sets enter the faces: 1 where they are proportional, 0 where no
-face has both (Bhattacharyya's coefficient)."""
+"""Least likeness of the shares that two data sets have in what their surveys tell of the faces that both saw: 1 where
+they are proportional, 0 where no face has both (Bhattacharyya's coefficient)."""
+SHARED = 0.5
+"""Of a data set's shares, how much must be in faces that both surveys saw."""
 
 
 class Summed(NamedTuple):
@@ -68,15 +71,31 @@ def _partners(
 ) -> dict[str, str]:
     """Of new data sets, by name, the one of the map that saw the same; each of the map has one of a survey at most."""
     alike = np.zeros((len(new), len(known)))
+    of_known, of_new = (_shares(some, weights) for some in (known, new))
+    shared = (np.sum([*of_known.values()], axis=0) > 0.0) & (np.sum([*of_new.values()], axis=0) > 0.0)
     for i, b in enumerate(new):
         for j, a in enumerate(known):
             way = float(np.linalg.norm(parts[a.name].centre - parts[b.name].centre))
             if a.movement == b.movement and way <= NEAR:
-                p, q = (np.maximum(weights[name], 0.0) for name in (a.name, b.name))
-                alike[i, j] = np.sqrt(p * q).sum() / max(float(np.sqrt(p.sum() * q.sum())), 1e-12)
+                alike[i, j] = _likeness(of_known[a.name], of_new[b.name], shared)
     rows, columns = linear_sum_assignment(alike, maximize=True)
     chosen = zip(rows.tolist(), columns.tolist(), strict=True)
     return {new[i].name: known[j].name for i, j in chosen if alike[i, j] >= ALIKE}
+
+
+def _shares(data_sets: Sequence[DataSet], weights: Mapping[str, Array]) -> dict[str, Array]:
+    """Of data sets of one survey, by name, the shares (n,) that they have in what it tells of each face."""
+    mine = {d.name: np.maximum(weights[d.name], 0.0) for d in data_sets}
+    whole = np.sum([*mine.values()], axis=0)
+    return {name: np.divide(w, whole, out=np.zeros_like(w), where=whole > 0.0) for name, w in mine.items()}
+
+
+def _likeness(p: Array, q: Array, shared: NDArray[np.bool_]) -> float:
+    """Likeness of two data sets by their shares (n,), in the faces that both surveys saw; 0 where these are few."""
+    both = p[shared].sum(), q[shared].sum()
+    if both[0] < SHARED * p.sum() or both[1] < SHARED * q.sum() or not all(both):
+        return 0.0
+    return float(np.sqrt(p * q)[shared].sum() / np.sqrt(both[0] * both[1]))
 
 
 class Sum(NamedTuple):

@@ -69,7 +69,7 @@ def assemble(
     members = [[snapped(member_of(s, pairs), k, shapes) for s in some] for k, some in enumerate(surfaces)]
     fields = {number: group.field for number, group in enumerate(groups)}
     regions = {
-        number: seen(members[number], [" ".join(s.data_sets) for s in surfaces[number]], field, params.gap)
+        number: seen(members[number], [s.data_sets for s in surfaces[number]], field, params.gap)
         for number, field in fields.items()
     }
     outlines = _outlines({number: region.whole for number, region in regions.items()}, fields)
@@ -77,11 +77,9 @@ def assemble(
     sides = creased_sides(member for some in members for member in some)
     found = find_topology(outlines, sides, shapes, params.gap)
     for _ in range(ROUNDS):
-        cut = cut_back(found.rings, regions, fields, near, params.distance)
-        if not cut:
+        if not (cut := cut_back(found.rings, regions, fields, near, params.distance)):
             break
-        kept = {number: loops for number, loops in outlines.items() if number not in cut}
-        outlines = kept | _outlines(cut, fields)
+        outlines = {k: loops for k, loops in outlines.items() if k not in cut} | _outlines(cut, fields)
         found = find_topology(outlines, sides, shapes, params.gap)
     made = []
     for number, rings in found.rings.items():

@@ -121,4 +121,4 @@ def _places(part: Region, field: HeightField) -> Array:
 def _sets(points: Array, seen: Seen, field: HeightField) -> IntArray:
     """(n,) how many data sets saw a face at points (n, 3)."""
     st = field.base.local(points)[:, :2]
-    return np.sum([len(name.split()) * shapely.contains_xy(r, st) for name, r in seen.by_set.items()], axis=0)
+    return np.sum([len(names) * shapely.contains_xy(r, st) for names, r in seen.by_set.items()], axis=0)

@@ -52,18 +52,20 @@ def snapped(member: Member, face: int, shapes: Shapes) -> Member:
 
 
 class Seen(NamedTuple):
-    """Region of a face of the map in s and t of its field's base, and those that each data set saw."""
+    """Region of a face of the map in s and t of its field's base, and those that each data set, or several that were
+    joined before, saw.
+    """
 
     whole: Region
-    by_set: dict[str, Region]
+    by_set: dict[tuple[str, ...], Region]
 
 
-def seen(members: Sequence[Member], sets: Sequence[str], field: HeightField, gap: float) -> Seen:
+def seen(members: Sequence[Member], sets: Sequence[tuple[str, ...]], field: HeightField, gap: float) -> Seen:
     """Union of the members' regions.
 
     members : snapped.  sets : the data sets of each.
     """
-    by_set: dict[str, list[Region]] = defaultdict(list)
+    by_set: dict[tuple[str, ...], list[Region]] = defaultdict(list)
     for name, member in zip(sets, members, strict=True):
         by_set[name].append(_region(member, field))
     creases = np.concatenate([np.zeros((0, 2, 3)), *creased_sides(members).values()])

@@ -111,7 +111,7 @@ def by_scatter(poses: Array, lines: Array, sightings: Sightings, fitted: Array) 
 
     A chord of a curved wall or an edge of clutter is another one in every scan; the noise of its points does not tell
     that, what is left of its errors does. Each line gets a variance of its own where that is above the common one,
-    drawn towards it by PRIOR_FREEDOM.
+    drawn towards it by PRIOR_FREEDOM, less what chance may do (its standard deviation).
 
     fitted : (m, 2), variances that the errors lack.
     """
@@ -126,4 +126,5 @@ def by_scatter(poses: Array, lines: Array, sightings: Sightings, fitted: Array) 
         each = np.bincount(sightings.line, weights=distance, minlength=len(lines))
         own *= (each + PRIOR_FREEDOM * common) / ((freedom + PRIOR_FREEDOM) * max(common, 1e-12))
         own = np.maximum(own, 1.0)
+    own = np.maximum(own / (1.0 + np.sqrt(2.0 / (freedom + PRIOR_FREEDOM))), 1.0)
     return sightings._replace(information=sightings.information / own[sightings.line, None, None])

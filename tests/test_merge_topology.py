@@ -15,7 +15,7 @@ from bsmap_cli.core.uncertainty import sensor_covariance
 from bsmap_cli.export.tessellation import tessellate_map
 from bsmap_cli.fit import fit_surfaces
 from bsmap_cli.merge import merge_surfaces
-from bsmap_cli.merge.bases import field_of
+from bsmap_cli.merge.bases import field_of, places_on
 from bsmap_cli.merge.extent import extended
 from bsmap_cli.model import BSplineSurface, Crease, SurfaceMap, TrimLoop
 from bsmap_cli.params import FitParams, MergeParams
@@ -332,3 +332,21 @@ def test_extended_surface_is_the_same_where_it_was():
     np.testing.assert_allclose(evaluate_surface(larger, *moved), evaluate_surface(surface, u, v), atol=1e-12)
     np.testing.assert_allclose(sensor_covariance(larger, *moved), sensor_covariance(surface, u, v), atol=1e-15)
     np.testing.assert_allclose(evaluate_surface(larger, [1.0], [0.0])[0, 0], 4.0 * high[0])
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_extended_surface_goes_on_straight_as_its_height_field_does(degree):
+    """A polynomial that goes on leaves the field on which its creases were found."""
+    surface = bowed(wall("a/1", 0.0, 4.0), 0.3)
+    inner = np.linspace(0.4, 0.8, 3 - degree)
+    knots = np.concatenate([np.zeros(degree + 1), inner, np.ones(degree + 1)])
+    P = np.random.default_rng(degree).normal(0.0, 0.1, (4, 2, 3)) * [0.0, 1.0, 0.0]
+    P[..., 0] = 4.0 * np.array([knots[k + 1 : k + 1 + degree].mean() for k in range(4)])[:, None]
+    P[:, 1, 2] = 2.5
+    covariance = replace(surface.covariance, matrix=np.eye(8))
+    surface = replace(surface, degree_u=degree, knots_u=knots, control_points=P, covariance=covariance)
+    low, high = np.array([-0.1, 0.0]), np.array([1.2, 1.0])
+    larger, field = extended(surface, low, high), field_of(surface)
+    uv = np.column_stack([np.linspace(low[0], high[0], 40), np.linspace(0.0, 1.0, 40)])
+    at = evaluate_surface(larger, *((uv - low) / (high - low)).T)
+    np.testing.assert_allclose(at, places_on(field, uv), atol=1e-9)

@@ -33,7 +33,8 @@ def trimmed(surface: BSplineSurface, rings: Sequence[Ring], shape: Shape) -> BSp
 def extended(surface: BSplineSurface, low: Array, high: Array) -> BSplineSurface:
     """The same surface over the parameters from `low` (2,) <= 0 to `high` (2,) >= 1, without its trims.
 
-    Its outer polynomials go on; the new control points are linear in the old ones, and so is their covariance.
+    Beyond its ends it goes on straight, as height fields do; the new control points are linear in the old ones, and so
+    is their covariance.
     """
     assert isinstance(surface.covariance, HeightCovariance)
     knots_u, by_u = _carry(surface.knots_u, surface.degree_u, low[0], high[0])
@@ -51,9 +52,15 @@ def extended(surface: BSplineSurface, low: Array, high: Array) -> BSplineSurface
 
 
 def _carry(knots: Array, degree: int, low: float, high: float) -> tuple[Array, Array]:
-    """Knots over [low, high] brought to [0, 1], and the matrix (n, n) from old to new control points."""
-    new = clamped_knots(degree, (inner_knots(knots, degree) - low) / (high - low))
-    at = greville(knots, degree)
-    # Splines on the same inner knots are the same functions: equal at as many places as there are control points.
+    """Knots over [low, high] brought to [0, 1], and the matrix (m, n) from old to new control points.
+
+    With knots at the old ends, so many that only value and slope are the same on both sides of them.
+    """
+    ends = [end for end, beyond in ((0.0, low < 0.0), (1.0, high > 1.0)) if beyond for _ in range(degree - 1)]
+    inner = np.append(inner_knots(knots, degree), ends)
+    new = clamped_knots(degree, (inner - low) / (high - low))
+    at = low + greville(new, degree) * (high - low)
+    inside = np.clip(at, 0.0, 1.0)
+    straight = (at - inside)[:, None] * design_matrix(knots, degree, inside, 1)
     basis = design_matrix(new, degree, (at - low) / (high - low))
-    return new, np.asarray(np.linalg.solve(basis, design_matrix(knots, degree, at)), dtype=np.float64)
+    return new, np.asarray(np.linalg.solve(basis, design_matrix(knots, degree, inside) + straight), dtype=np.float64)

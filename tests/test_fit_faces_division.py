@@ -8,7 +8,7 @@ from face_scenes import corridor_set
 
 from bsmap_cli.fit import pieces
 from bsmap_cli.fit.beams import make_grid
-from bsmap_cli.fit.blocks import FEWEST, LARGEST, LONGEST, make_blocks, single_beams
+from bsmap_cli.fit.blocks import FEWEST, FEWEST_ROWS, LARGEST, LONGEST, make_blocks, single_beams, thinned
 
 
 def holed_grid():
@@ -99,3 +99,34 @@ def test_blocks_are_means_of_equal_shares_of_their_runs():
                 np.testing.assert_allclose(blocks.column[at], mine.mean(), atol=1e-9)
                 at += 1
     assert (at, single) == (len(blocks.counts), len(beams.counts))
+
+
+def test_blocks_of_close_scans_are_taken_together():
+    scans = 120
+    grid = make_grid(corridor_set(scans=scans).cloud, np.arange(scans))
+    row = np.repeat(np.arange(scans), 2)
+    start = np.tile([100, 230], scans)
+    blocks = make_blocks(grid, row, start, start + np.tile([60, 40], scans))
+    for beams, narrow in ((LARGEST, 0.05), (LARGEST, 1.0), (1, 0.1)):
+        cell = (blocks.column / beams).astype(int)
+        at = dict(zip(zip(blocks.row.tolist(), cell.tolist(), strict=True), blocks.points, strict=True))
+        steps = [np.linalg.norm(at[r + 1, c] - place) for (r, c), place in at.items() if (r + 1, c) in at]
+        together = int(min(narrow / np.quantile(steps, 0.95), (scans - 1) / FEWEST_ROWS)) + 1
+        assert together > 1
+        found = thinned(blocks, beams, narrow)
+        groups = sorted(set(zip((blocks.row // together).tolist(), cell.tolist(), strict=True)))
+        assert len(found.counts) == len(groups)
+        for k, (group, c) in enumerate(groups):
+            own = (blocks.row // together == group) & (cell == c)
+            weight = blocks.counts[own]
+            assert found.counts[k] == weight.sum()
+            np.testing.assert_allclose(found.points[k], np.average(blocks.points[own], axis=0, weights=weight))
+            way = np.average(blocks.directions[own], axis=0, weights=weight)
+            np.testing.assert_allclose(found.directions[k], way / np.linalg.norm(way))
+            assert found.row[k] == blocks.row[own][0]
+
+
+def test_blocks_of_scans_far_apart_stay():
+    grid = holed_grid()
+    blocks = make_blocks(grid, np.arange(4), np.full(4, 100), np.full(4, 160))
+    assert thinned(blocks) is blocks

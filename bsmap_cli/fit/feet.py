@@ -163,12 +163,14 @@ def _chunks(face: IntArray, faces: int) -> Iterator[tuple[slice | IntArray, IntA
     if len(face) <= CHUNK:
         yield slice(None), face[:1] if faces == 1 else face
         return
-    # Short numbers are sorted in one pass.
-    order = np.argsort(face.astype(np.int16 if faces < 2**15 else np.int64), kind="stable")
-    ordered = face[order]
-    for a, b in itertools.pairwise([0, *(np.flatnonzero(np.diff(ordered)) + 1).tolist(), len(face)]):
-        for first in range(a, b, CHUNK):
-            yield order[first : min(first + CHUNK, b)], ordered[a : a + 1]
+    order = None
+    if np.any(face[1:] < face[:-1]):
+        # Short numbers are sorted in one pass.
+        order = np.argsort(face.astype(np.int16 if faces < 2**15 else np.int64), kind="stable")
+        face = face[order]
+    for a, b in itertools.pairwise([0, *(np.flatnonzero(np.diff(face)) + 1).tolist(), len(face)]):
+        for part in (slice(first, min(first + CHUNK, b)) for first in range(a, b, CHUNK)):
+            yield part if order is None else order[part], face[a : a + 1]
 
 
 def offsets(table: Table, face: IntArray, points: Array) -> tuple[Array, Array]:

@@ -65,11 +65,16 @@ def feet_of(grid: BeamGrid, field: HeightField, mask: NDArray[np.bool_]) -> Feet
 
 def places_of_faces(grid: BeamGrid, labels: IntArray, faces: int) -> list[IntArray]:
     """Flat indices of the beams of each of so many faces that have a return, in the order of the grid."""
-    at = np.flatnonzero((labels >= 0) & grid.hit)
-    face = labels.ravel()[at]
-    at = at[np.argsort(face.astype(np.int16 if faces < 2**15 else np.int64), kind="stable")]
-    ends = np.cumsum(np.bincount(face, minlength=faces)).tolist()
+    at = _by_face(np.flatnonzero((labels >= 0) & grid.hit), labels, faces)
+    ends = np.cumsum(np.bincount(labels.ravel()[at], minlength=faces)).tolist()
     return [at[a:b] for a, b in itertools.pairwise([0, *ends])]
+
+
+def _by_face(at: IntArray, labels: IntArray, faces: int) -> IntArray:
+    """Flat indices `at` (k,) of beams, face after face."""
+    # Short numbers are sorted in one pass.
+    kind = np.int16 if faces < 2**15 else np.int64
+    return at[np.argsort(labels.ravel()[at].astype(kind), kind="stable")]
 
 
 def feet_of_faces(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField]) -> list[Feet]:
@@ -109,7 +114,7 @@ def find_misses(
     new = (labels >= 0) & grid.hit
     if known is not None:
         new &= labels != known.labels
-    at = np.flatnonzero(new)
+    at = _by_face(np.flatnonzero(new), labels, len(fields))
     start = None
     if before is not None:
         start = np.where(before.labels.ravel()[at] >= 0, before.beyond.ravel()[at], 0.0)

@@ -53,7 +53,8 @@ class _Rest(NamedTuple):
         """Standard deviations along the beam from the beams `which` (k,) to a plane; infinite where it is grazed."""
         sine = self.directions[which] @ normal
         height = (self.points[which] - origin) @ normal
-        return np.where(np.abs(sine) > INCIDENCE, np.abs(height / sine) / self.sigma, np.inf)
+        steep = np.abs(sine) > INCIDENCE
+        return np.where(steep, np.abs(height) / (self.sigma * np.where(steep, np.abs(sine), 1.0)), np.inf)
 
 
 def find_planes(grid: BeamGrid, labels: IntArray, sigma: float) -> IntArray:

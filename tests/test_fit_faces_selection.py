@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from bsmap_cli.core.bspline import clamped_knots, inner_knots, open_knots
+from bsmap_cli.fit import selection
 from bsmap_cli.fit.blocks import Blocks
 from bsmap_cli.fit.heights import CylinderBase, HeightField, Knots, PlaneBase, basis_matrix, evaluate, least_knots
 from bsmap_cli.fit.selection import PRICE, fit_heights, refit, told
@@ -104,3 +105,17 @@ def test_covariance_of_bent_faces_holds_their_errors():
         inside.append(np.mean(error**2 < 3.84 * variance))
     assert len(inside) > 20
     assert 0.91 < np.mean(inside) < 0.98
+
+
+@pytest.mark.parametrize("spans", [1, 3, 7, 20])
+def test_normal_equations_are_products_of_all_basis_functions(spans):
+    """Each span for itself, where there are many; one of them has no data."""
+    inner = np.arange(1, spans) / spans
+    knots = Knots(3, 2, clamped_knots(3, inner), clamped_knots(2, np.array([0.5])))
+    data = selection._linearise(field_on(knots), blocks_of(lambda s, t: 0.1 * np.sin(s) * t, until=3.7), SIGMA)
+    A, b = selection._normal_equations(knots, data)
+    N = basis_matrix(knots, data.feet.uv) * data.root[:, None]
+    np.testing.assert_allclose(A, N.T @ N, atol=1e-9 * A.max())
+    np.testing.assert_allclose(b, N.T @ data.wanted, atol=1e-9 * np.abs(b).max())
+    heights = np.random.default_rng(0).normal(size=knots.size)
+    np.testing.assert_allclose(selection._misfit(knots, heights, data), N @ heights - data.wanted, atol=1e-9)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bsmap_cli.core.bspline import clamped_knots, design_matrix, inner_knots
+from bsmap_cli.core.knots import find_spans
 from bsmap_cli.fit.blocks import Blocks
 from bsmap_cli.fit.feet import Met, meet, tabulate
 from bsmap_cli.fit.heights import (
@@ -19,7 +20,7 @@ from bsmap_cli.fit.heights import (
     with_degree,
     with_knot,
 )
-from bsmap_cli.model import Array
+from bsmap_cli.model import Array, IntArray
 
 PRICE = 5.0
 """Of a control point, in chi square: between Akaike's 2, which keeps the covariance honest, and the logarithm of the
@@ -38,6 +39,8 @@ NEAR = 0.1
 """Standard deviations of a beam by which heights may change before the equations are made anew."""
 SETTLED = 1e-5
 """Metres of change of the heights below which a fit about its own result is not repeated."""
+MANY = 8
+"""Control points along s from which each span is worked on for itself."""
 CHUNK = 2048
 """Rows of the equations that are worked on at a time."""
 MOST = 400
@@ -185,12 +188,28 @@ def _normal_equations(knots: Knots, data: _Data) -> tuple[Array, Array]:
     """(k, k) and (k,): products of the basis functions' products with each other, and with the heights wanted."""
     along_s, along_t = data.basis(0, knots.degree_s, knots.s), data.basis(1, knots.degree_t, knots.t)
     A, b = np.zeros((knots.size, knots.size)), np.zeros(knots.size)
-    # So many rows at once stay in the processor's cache.
-    for part in (slice(first, first + CHUNK) for first in range(0, len(along_s), CHUNK)):
-        N = (along_s[part, :, None] * along_t[part, None, :]).reshape(-1, knots.size)
-        A += N.T @ N
-        b += data.wanted[part] @ N
+    nt = knots.shape[1]
+    for rows, own in _parts(knots, data):
+        N = (along_s[rows, own, None] * along_t[rows, None, :]).reshape(-1, (own.stop - own.start) * nt)
+        there = slice(own.start * nt, own.stop * nt)
+        A[there, there] += N.T @ N
+        b[there] += data.wanted[rows] @ N
     return A, b
+
+
+def _parts(knots: Knots, data: _Data) -> Iterator[tuple[slice | IntArray, slice]]:
+    """Rows of the equations worked on at a time, which fit into the cache, and the functions along s that they need.
+
+    Where there are many spans along s, the rows of each are taken for themselves: the others' functions are 0 there.
+    """
+    ns, degree = knots.shape[0], knots.degree_s
+    if ns < MANY:
+        yield from ((slice(first, first + CHUNK), slice(0, ns)) for first in range(0, len(data.root), CHUNK))
+        return
+    span = find_spans(knots.s, degree, np.clip(data.feet.uv[:, 0], 0.0, 1.0)) - degree
+    order = np.argsort(span, kind="stable")
+    for first, rows in enumerate(np.split(order, np.cumsum(np.bincount(span, minlength=ns - degree))[:-1])):
+        yield rows, slice(first, first + degree + 1)
 
 
 def _misfit(knots: Knots, heights: Array, data: _Data) -> Array:

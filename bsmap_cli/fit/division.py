@@ -12,6 +12,7 @@ from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.blocks import Blocks, make_blocks, single_beams, thinned
 from bsmap_cli.fit.clutter import find_planes
 from bsmap_cli.fit.crossings import find_crossings
+from bsmap_cli.fit.grazing import without_grazed_ends
 from bsmap_cli.fit.heights import Base, Bulge, CylinderBase, HeightField, PlaneBase, plane_base
 from bsmap_cli.fit.labels import (
     Misses,
@@ -82,6 +83,7 @@ def find_faces(grid: BeamGrid) -> Faces:
         misses = find_misses(grid, divided, fields, misses)
         misses = misses._replace(labels=without_alike(grid, misses, sigma))
         divided = without_slipped_ends(grid, misses, fields, sigma)
+        divided = without_grazed_ends(grid, divided, fields, sigma)
         if step < ROUNDS - 1:
             divided = find_planes(grid, divided, sigma)
             labels, fitted = _fit_changed(grid, labels, divided, fitted, sigma)

@@ -13,9 +13,20 @@ import numpy as np
 
 from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.context import PRICE, Context, make_context
-from bsmap_cli.fit.lowmodels import ORDERS, Frame, PlaneFrame, Sums, chi_squares, sums_of_rows, weighted_rows
+from bsmap_cli.fit.grazing import GRAZED, STEEPER
+from bsmap_cli.fit.lowmodels import (
+    ORDERS,
+    Frame,
+    PlaneFrame,
+    Sums,
+    chi_squares,
+    fit_plane_frame,
+    sums_of,
+    sums_of_rows,
+    weighted_rows,
+)
 from bsmap_cli.fit.pieces import Pieces
-from bsmap_cli.fit.seeds import bent_seeds, cylinder_seeds, pairs, plane_seeds
+from bsmap_cli.fit.seeds import bent_seeds, cylinder_seeds, pairs, plane_seeds, rough_normal
 from bsmap_cli.fit.unions import unite_regions
 from bsmap_cli.model import IntArray
 
@@ -38,7 +49,7 @@ def find_regions(grid: BeamGrid, pieces: Pieces) -> tuple[list[list[int]], float
     for pair in pairs(context, owner):
         owner[pair] = len(regions)
         regions.append(pair)
-    return unite_regions(context, regions), context.sigma
+    return unite_regions(context, without_grazed_scans(context, regions, owner)), context.sigma
 
 
 def _sizes(frame: Frame, rows: int) -> tuple[int, ...]:
@@ -79,3 +90,58 @@ def _grow(context: Context, owner: IntArray, seed: list[int], frame: Frame) -> l
             sums, cost = more, joint
             waiting.extend(context.neighbours[k])
     return members
+
+
+def without_grazed_scans(context: Context, regions: list[list[int]], owner: IntArray) -> list[list[int]]:
+    """Regions without the pieces at their ends that they only graze and that the next scan's region explains.
+
+    A scan in the plane that touches a pillar's side lies on the pillar and on the wall behind it; with the pillar's
+    parts it lies on no cylinder. owner : (k,) region of each piece, -1 for none; changed in place.
+    """
+    regions = [list(members) for members in regions]
+    for members in regions:
+        for step in (-1, 1):
+            for piece, inner in _ends(context, members, step):
+                normal = rough_normal(context, [piece, inner])
+                if normal is None or np.abs(context.blocks_of([piece]).directions @ normal).mean() > GRAZED:
+                    continue
+                other = _next_region(context, owner, piece, step)
+                if other is not None and _explains(context, regions[other], piece):
+                    members.remove(piece)
+                    regions[other].append(piece)
+                    owner[piece] = other
+    return [members for members in regions if members]
+
+
+def _ends(context: Context, members: list[int], step: int) -> list[tuple[int, int]]:
+    """Pieces of a region in its last scan in a direction, each with its longest neighbour in the scan before."""
+    row = context.pieces.row
+    last = max((int(row[k]) * step for k in members), default=0) * step
+    out = []
+    for piece in [k for k in members if row[k] == last]:
+        inner = [k for k in context.neighbours[piece] if row[k] == last - step and k in members]
+        if inner:
+            out.append((piece, max(inner, key=lambda k: float(context.beams[k]))))
+    return out
+
+
+def _next_region(context: Context, owner: IntArray, piece: int, step: int) -> int | None:
+    """Region of the longest piece beside another one in the next scan; None where that is the same or none."""
+    row = context.pieces.row
+    beyond = [k for k in context.neighbours[piece] if row[k] == row[piece] + step]
+    if not beyond:
+        return None
+    found = int(owner[max(beyond, key=lambda k: float(context.beams[k]))])
+    return found if found >= 0 and found != owner[piece] else None
+
+
+def _explains(context: Context, members: list[int], piece: int) -> bool:
+    """Whether a region meets a piece steeply and explains it at less than the piece's own price."""
+    blocks, more = context.blocks_of(members), context.blocks_of([piece])
+    frame = fit_plane_frame(blocks)
+    if np.abs(more.directions @ frame.axes[:, 2]).mean() < STEEPER * GRAZED:
+        return False
+    rows = len(set(context.pieces.row[members].tolist()))
+    sums = sums_of(frame, blocks, context.sigma)
+    growth = _cost(sums.plus(sums_of(frame, more, context.sigma)), frame, rows) - _cost(sums, frame, rows)
+    return bool(growth < context.chi[piece] + context.price[piece] + context.slack * context.beams[piece])

@@ -57,7 +57,7 @@ def _seeds(context: Context, owner: IntArray, before: int, after: int, size: int
         if chain is None:
             continue
         blocks = context.blocks_of(chain)
-        frame = fit_plane_frame(blocks, _rough_normal(context, chain))
+        frame = fit_plane_frame(blocks, rough_normal(context, chain))
         if _incidence(frame, blocks) < SEED_INCIDENCE:
             continue
         if joint_excess(context, chain, sums_of(frame, blocks, context.sigma), size) < 0.0:
@@ -92,14 +92,14 @@ def pairs(context: Context, owner: IntArray) -> Iterator[list[int]]:
                 continue
             pair = [first, second]
             blocks = context.blocks_of(pair)
-            frame = fit_plane_frame(blocks, _rough_normal(context, pair))
+            frame = fit_plane_frame(blocks, rough_normal(context, pair))
             sums = sums_of(frame, blocks, context.sigma)
             if _incidence(frame, blocks) > PAIR_INCIDENCE and joint_excess(context, pair, sums, 3) < 0.0:
                 yield pair
                 break
 
 
-def _rough_normal(context: Context, chain: list[int]) -> Array | None:
+def rough_normal(context: Context, chain: list[int]) -> Array | None:
     """Normal of the plane of a piece's direction and the way from scan to scan; None where these are parallel."""
     order = sorted(chain, key=lambda k: context.pieces.row[k])
     parts = [context.blocks_of([k]) for k in order]

@@ -68,11 +68,12 @@ def interpolate(time_ns: IntArray, poses: Array, at_ns: IntArray) -> Array:
     before = (np.searchsorted(time_ns, at_ns, side="right") - 1).clip(0, n - 2)
     gone = np.clip(at_ns - time_ns[before], 0, None).astype(float)
     share = np.minimum(gone / np.maximum(time_ns[before + 1] - time_ns[before], 1), 1.0)
-    step = between(poses[before], poses[before + 1])
-    turn = step[:, 2]
+    step = between(poses[:-1], poses[1:])
     # The part of an arc is as long as the whole one's chord by the ratio of sines, and leaves under half its turn.
-    length = share * np.sinc(share * turn / _TURN) / np.sinc(turn / _TURN)
-    away = (share - 1.0) * turn / 2.0
-    c, s = np.cos(away), np.sin(away)
-    x, y = length * (c * step[:, 0] - s * step[:, 1]), length * (s * step[:, 0] + c * step[:, 1])
-    return compose(poses[before], np.stack([x, y, share * turn], axis=1))
+    chord = step[:, :2] / np.sinc(step[:, 2:] / _TURN)
+    start, turn = poses[before], step[before, 2]
+    dx, dy = chord[before].T
+    length = share * np.sinc(share * turn / _TURN)
+    heading = start[:, 2] + (share - 1.0) * turn / 2.0
+    c, s = length * np.cos(heading), length * np.sin(heading)
+    return _pose(start[:, 0] + c * dx - s * dy, start[:, 1] + s * dx + c * dy, start[:, 2] + share * turn)

@@ -57,3 +57,14 @@ def test_only_a_grazing_scan_that_the_wall_explains_is_given_to_it(passed):
     # A wall that does not explain it does not get it.
     fields[wall] = replace(fields[wall], heights=fields[wall].heights + 0.05)
     assert np.all(without_grazed_ends(grid, labels, fields, faces.sigma)[given] == pillar)
+
+
+def test_beams_in_a_line_are_no_face_that_stands_on_edge():
+    # One beam of each scan on a side of the recess: any plane through their line would fit them.
+    place = passing_set(corridor_mesh(), seed=1, scans=300, beams=271)
+    grid = make_grid(place.cloud, np.arange(300))
+    faces = find_faces(grid)
+    assert np.mean(faces.labels[grid.hit] >= 0) > 0.995
+    feet = feet_of_faces(grid, faces.labels, [f.field for f in faces.fitted])
+    error = distance_to_mesh(np.concatenate([of.points for of in feet]), place.vertices, place.triangles)
+    assert error.max() < 0.02

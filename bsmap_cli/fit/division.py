@@ -13,7 +13,7 @@ from bsmap_cli.fit.blocks import Blocks, make_blocks, single_beams, thinned
 from bsmap_cli.fit.clutter import find_planes
 from bsmap_cli.fit.crossings import find_crossings
 from bsmap_cli.fit.grazing import without_grazed_ends
-from bsmap_cli.fit.heights import Base, Bulge, CylinderBase, HeightField, PlaneBase, plane_base
+from bsmap_cli.fit.heights import Base, Bulge, CylinderBase, HeightField, PlaneBase, evaluate, plane_base
 from bsmap_cli.fit.labels import (
     Misses,
     Runs,
@@ -40,6 +40,8 @@ FARTHEST = 1.0
 """Metres by which a face's rectangle may grow towards its creases."""
 BELIEVED = 0.9
 """Share of its beams that a face must fit."""
+STEEPEST_HEIGHTS = 3.0
+"""Slope of the heights of a face over its base, 72 degrees."""
 LITTLE = 0.05
 """Share of its beams in which a face has hardly changed."""
 CLOSE = 0.01
@@ -95,7 +97,12 @@ def find_faces(grid: BeamGrid) -> Faces:
             fitted = _refit_all(grid, labels, [fields[k] for k in kept], sigma)
     labels, kept = _believed(grid, labels, [f.field for f in fitted], misses, sigma)
     fitted = [fitted[k] for k in kept]
-    return Faces(labels, _widened(grid, labels, fitted, sigma), sigma)
+    fitted = _widened(grid, labels, fitted, sigma)
+    for number, one in enumerate(fitted):
+        if _stands_on_edge(one.field, grid.points[(labels == number) & grid.hit]):
+            labels[labels == number] = -1
+    labels, kept = _kept(labels, grid)
+    return Faces(labels, [fitted[k] for k in kept], sigma)
 
 
 def _widened(grid: BeamGrid, labels: IntArray, fitted: list[Fitted], sigma: float) -> list[Fitted]:
@@ -136,6 +143,12 @@ def _believed(
         if after < BELIEVED * before:
             final[final == number] = -1
     return _kept(fill(grid, final), grid)
+
+
+def _stands_on_edge(field: HeightField, points: Array) -> bool:
+    """Whether a field is far too steep over its base at the beams' ends (n, 3): beams in one line tell no plane."""
+    gradient = evaluate(field, field.parameters(field.base.local(points)))[1]
+    return bool(np.median(np.sum(gradient**2, axis=1)) > STEEPEST_HEIGHTS**2)
 
 
 def _renumber(labels: IntArray, grid: BeamGrid) -> IntArray:

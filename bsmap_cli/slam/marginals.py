@@ -14,8 +14,8 @@ from bsmap_cli.slam.posegraph import factorise
 
 MOST_POSES = 300
 """Poses solved for exactly; those between them are interpolated, for neighbours err alike."""
-COLUMNS = 120
-"""Columns solved for at once."""
+COLUMNS, LINES = 120, 100
+"""Columns solved for and lines looked at at once."""
 
 
 class Marginals(NamedTuple):
@@ -62,9 +62,12 @@ def _of_lines(information: sparse.csc_matrix, joint: Array, at: IntArray, poses:
     share = np.where(after > before, (every - at[before]) / np.maximum(at[after] - at[before], 1), 1.0)
     rows, columns = np.tile(every - 1, 2), np.concatenate([before, after])
     shares = sparse.coo_array((np.concatenate([1.0 - share, share]), (rows, columns)), (poses - 1, len(at)))
-    by_poses = np.asarray((information[first:, :first] @ sparse.kron(shares, np.eye(3))).todense())
-    by_poses = left @ by_poses.reshape(-1, 2, len(joint))
-    return left + (by_poses @ joint) @ np.swapaxes(by_poses, 1, 2)
+    by_poses = sparse.csr_matrix(information[first:, :first] @ sparse.kron(shares, np.eye(3)))
+    for start in range(0, len(left), LINES):  # the rows are dense, and there are many
+        some = slice(start, start + LINES)
+        rows = left[some] @ by_poses[2 * start : 2 * (start + LINES)].toarray().reshape(-1, 2, len(joint))
+        left[some] += (rows @ joint) @ np.swapaxes(rows, 1, 2)
+    return left
 
 
 def _with_first(blocks: Array) -> Array:

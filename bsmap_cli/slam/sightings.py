@@ -10,7 +10,7 @@ from bsmap_cli.model import Array, IntArray
 from bsmap_cli.slam.posegraph import ROBUST_WIDTH, Term, robust_means
 from bsmap_cli.slam.segments import Segments
 
-AT_ONCE = 400
+AT_ONCE = 100
 """Segments compared with all lines at a time."""
 
 

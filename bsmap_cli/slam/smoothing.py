@@ -98,6 +98,7 @@ def smooth(
         problem = _Problem(*every, taken)
         for _ in range(iterations):
             information, side = _normal_equations(poses, parameters, problem.scaled(scales))
+            factors = None  # each takes tens of megabytes: the old ones go before the new ones come
             factors = posegraph.factorise(information)
             poses, parameters, largest = _stepped(poses, parameters, factors.solve(side))
             scales = scales * _variance_components(problem.scaled(scales), poses, parameters, factors)

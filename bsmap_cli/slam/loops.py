@@ -33,7 +33,8 @@ ROUNDS = 8
 SPACING = 1.0
 """Metres of way between key scans for which loops are sought."""
 WIDE_SPACING, WIDE_TURN, UNHELD = 3.0, 0.5, 10.0
-"""Metres of way between wide searches, radians to both sides, metres of way from any closure where they are made."""
+"""Metres of way between wide searches, and between candidates of a first look round; radians to both sides, metres of
+way from any closure where they are made."""
 DRIFT, MOST_REACH = 0.02, 10.0
 """A place counts as near within REACH metres, and DRIFT more for each metre of way since, up to MOST_REACH."""
 PASSES = 3
@@ -76,13 +77,17 @@ def close_loops(tracking: Tracking, range_sigma: float, track: Track) -> Closure
     for k in range(ROUNDS):
         track("slam: loops", k, ROUNDS)
         look = Search(tracking.points, poses, way, noise)
-        found = _find(look, closures, failed, _far_from(closures, way) if wide else None)
+        # A first look at few places sets the poses right for the others: fewer candidates lead nowhere.
+        spacing = WIDE_SPACING if wide or k == 0 else SPACING
+        found = _find(look, closures, failed, spacing, _far_from(closures, way) if wide else None)
         if wide:
             found = joined([found, witnesses(look, take(found, ~_supported(look, found)))])
         supported = _supported(look, found)
         alone.append(take(found, ~supported))
         found = take(found, supported)
         if len(found.first) == 0:
+            if k == 0:
+                continue
             if wide:
                 break
             # Where the poses lead past no known place, they may be too far off for a match without a search.
@@ -172,9 +177,9 @@ def _relocated(tracking: Tracking, poses: Array, noise: float) -> Edges:
     found = [no_edges()]
     for key in np.flatnonzero(tracking.weak).tolist():
         at = int(np.searchsorted(sound, key))
-        around = sound[max(at - TARGET_KEYS, 0) : at + TARGET_KEYS]
+        near = sound[max(at - TARGET_KEYS, 0) : at + TARGET_KEYS]
         before, after = int(sound[max(at - 1, 0)]), int(sound[min(at, len(sound) - 1)])
-        target = make_target(small_map(look, before, around.tolist()))
+        target = make_target(small_map(look, before, near.tolist()))
         guesses = [se2.between(poses[before], poses[k]) for k in (key, after, before)]
         matches = [register(tracking.points[key], target, guess, noise, 1.5, 0.8) for guess in guesses]
         best = max((m for m in matches if m is not None), key=lambda m: m.inliers, default=None)
@@ -184,9 +189,13 @@ def _relocated(tracking: Tracking, poses: Array, noise: float) -> Edges:
 
 
 def _find(
-    look: Search, closures: Edges, failed: dict[tuple[int, int], Array], wide: NDArray[np.bool_] | None = None
+    look: Search,
+    closures: Edges,
+    failed: dict[tuple[int, int], Array],
+    spacing: float,
+    wide: NDArray[np.bool_] | None = None,
 ) -> Edges:
-    """Closures between places that are near each other by the poses as they are.
+    """Closures between places that are near each other by the poses as they are, every `spacing` metres of way.
 
     closures : found before; the same visit is not closed twice.  failed : guesses from which a match failed; they are
     not tried again, and new ones are added.
@@ -194,7 +203,7 @@ def _find(
     """
     found, targets = [no_edges()], dict[int, Target]()
     known = set(zip(closures.second.tolist(), (closures.first // TARGET_KEYS).tolist(), strict=True))
-    for here, before in _candidates(look, SPACING if wide is None else WIDE_SPACING):
+    for here, before in _candidates(look, spacing):
         visit = before // TARGET_KEYS
         if known & {(here, visit - 1), (here, visit), (here, visit + 1)} or (wide is not None and not wide[here]):
             continue

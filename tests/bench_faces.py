@@ -214,6 +214,9 @@ def main(seeds):
         places = [corridor_set(sigma, seed) for seed in range(seeds)]
         show(f"20 x 541, {1e3 * sigma:g} mm", [measure(place, np.arange(20)) for place in places])
     show("400 x 1081, 10 mm", [measure(corridor_set(scans=400, beams=1081), np.arange(400))])
+    for scans, beams in ((10, 361), (40, 541), (200, 541)):
+        places = [corridor_set(scans=scans, beams=beams, seed=seed) for seed in range(max(1, seeds // 3))]
+        show(f"{scans} x {beams}, 10 mm", [measure(place, np.arange(scans)) for place in places])
     simulated_rows("room", max(1, seeds // 3))
     simulated_rows("corridor", max(1, seeds // 5))
     simulated_rows("loop", 1)

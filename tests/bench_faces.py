@@ -37,7 +37,7 @@ from bsmap_cli.fit.beams import make_grid
 from bsmap_cli.fit.division import find_faces
 from bsmap_cli.fit.faces import fit_set
 from bsmap_cli.fit.heights import basis_matrix, evaluate
-from bsmap_cli.fit.labels import OUTLIER, feet_of, feet_of_faces
+from bsmap_cli.fit.labels import OUTLIER, feet_of_faces
 from bsmap_cli.model import SurfaceMap
 
 CAP = 0.1
@@ -114,7 +114,7 @@ def measure(place, scans, kind="translation"):
     start = time.process_time()
     made = fit_set(place.cloud, scans, "set", grid, 0)
     seconds = time.process_time() - start
-    of_faces = [feet_of(grid, f.field, (faces.labels == k) & grid.hit) for k, f in enumerate(faces.fitted)]
+    of_faces = feet_of_faces(grid, faces.labels, [f.field for f in faces.fitted])
     feet = np.concatenate([found.points for found in of_faces])
     variance = np.concatenate([height_variance(f, of.uv) for f, of in zip(faces.fitted, of_faces, strict=True)])
     error = distance_to_mesh(feet, place.vertices, place.triangles)

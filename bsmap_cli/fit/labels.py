@@ -58,11 +58,6 @@ def met_at(
     return meet(table, face, points, directions, row * grid.hit.shape[1] + column, start)
 
 
-def feet_of(grid: BeamGrid, field: HeightField, mask: NDArray[np.bool_]) -> Feet:
-    """Feet of the beams of a mask (m, n) on a height field."""
-    return find_feet(tabulate([field]), np.zeros(mask.sum(), dtype=np.int64), grid.points[mask], grid.directions[mask])
-
-
 def places_of_faces(grid: BeamGrid, labels: IntArray, faces: int) -> list[IntArray]:
     """Flat indices of the beams of each of so many faces that have a return, in the order of the grid."""
     at = _by_face(np.flatnonzero((labels >= 0) & grid.hit), labels, faces)

@@ -18,7 +18,6 @@ from bsmap_cli.slam.submaps import (
     TARGET_KEYS,
     Search,
     agree,
-    around,
     closure_edge,
     no_edges,
     register,
@@ -213,8 +212,8 @@ def _find(
         if before not in targets:
             if len(targets) == KEPT:
                 targets.clear()
-            targets[before] = target_map(look, before, around(before, TARGET_KEYS, len(look.poses)))
-        source = source_map(look, here, around(here, SOURCE_KEYS, len(look.poses)))
+            targets[before] = target_map(look, before)
+        source = source_map(look, here)
         span = float(_reach(look.way[here] - look.way[before]))
         closure = register(source, targets[before], guess, look.noise, span, 0.0 if wide is None else WIDE_TURN)
         if closure is None:

@@ -14,7 +14,6 @@ from bsmap_cli.slam.submaps import (
     TARGET_KEYS,
     Search,
     agree,
-    around,
     closure_edge,
     no_edges,
     register,
@@ -59,8 +58,8 @@ def _witness(look: Search, here: int, pose: Array) -> Edges | None:
     before = int(np.argmin(distance))
     if distance[before] > REACH:
         return None
-    target = target_map(look, before, around(before, TARGET_KEYS, len(look.poses)))
-    source = source_map(look, here, around(here, SOURCE_KEYS, len(look.poses)))
+    target = target_map(look, before)
+    source = source_map(look, here)
     guess = se2.between(look.poses[before], pose)
     seen = register(source, target, guess, look.noise, 0.0, 0.0)
     return closure_edge(before, here, seen) if seen is not None and agree(guess, seen.pose) else None
@@ -112,10 +111,10 @@ def _recognise(look: Search, start: int, after: int) -> Edges:
     here = _spaced(look.way, np.arange(after + SOURCE_KEYS, len(look.way)))[:TRIES]
     if len(places) == 0:
         return no_edges()
-    maps = [target_map(look, int(k), around(int(k), TARGET_KEYS, start)) for k in places]
+    maps = [target_map(look, int(k)) for k in places]
     prints = np.array([fingerprint(target.points) for target in maps])
     for key in here.tolist():
-        source = source_map(look, key, around(key, SOURCE_KEYS, len(look.way)))
+        source = source_map(look, key)
         apart = np.abs(prints - fingerprint(source)).sum(axis=1)
         for k in np.argsort(apart, kind="stable")[:ALIKE].tolist():
             seen = register(source, maps[k], np.zeros(3), look.noise, PLACE_SPACING, np.pi)

@@ -47,14 +47,16 @@ def around(centre: int, half: int, count: int) -> range:
     return range(max(centre - half, 0), min(centre + half + 1, count))
 
 
-def source_map(look: Search, centre: int, keys: range) -> OrientedPoints:
-    """Points of key scans in the frame of one of them, evenly thinned to about SOURCE_POINTS."""
+def source_map(look: Search, centre: int, keys: range | None = None) -> OrientedPoints:
+    """Points of key scans (by default those near it) in the frame of one, evenly thinned to about SOURCE_POINTS."""
+    keys = around(centre, SOURCE_KEYS, len(look.poses)) if keys is None else keys
     count = sum(len(look.points[j].xy) for j in keys)
     return small_map(look, centre, keys, max(1, count // SOURCE_POINTS))
 
 
-def target_map(look: Search, centre: int, keys: range) -> Target:
-    return make_target(small_map(look, centre, keys))
+def target_map(look: Search, centre: int, keys: range | None = None) -> Target:
+    """Points of key scans (by default those near it) in the frame of one, to be matched against."""
+    return make_target(small_map(look, centre, around(centre, TARGET_KEYS, len(look.poses)) if keys is None else keys))
 
 
 def small_map(look: Search, centre: int, keys: Sequence[int], step: int = 1) -> OrientedPoints:

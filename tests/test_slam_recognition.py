@@ -11,7 +11,7 @@ from bsmap_cli.params import SlamParams
 from bsmap_cli.slam import run_slam
 from bsmap_cli.slam.loops import close_loops, lost_runs
 from bsmap_cli.slam.matching import OrientedPoints
-from bsmap_cli.slam.recognition import fingerprint
+from bsmap_cli.slam.recognition import TURN_STEP, fingerprint, likely_turns
 from bsmap_cli.slam.tracking import track_scans
 from bsmap_cli.track import silent
 
@@ -74,3 +74,12 @@ def test_fingerprint_is_the_same_from_wherever_a_place_is_looked_at():
     assert np.abs(fingerprint(other) - fingerprint(seen)).sum() > 0.2
     none = OrientedPoints(np.zeros((0, 2)), np.zeros((0, 2)))
     assert fingerprint(none).sum() == 0.0
+
+
+def test_likely_turns_hold_the_true_one():
+    seen = wall_points(room(), (0.0, 0.0))
+    for turn in (0.0, 0.4, 2.0, -1.3, 3.1):
+        turned = seen.moved(np.array([3.0, -7.0, turn]))
+        found = likely_turns(seen.normal, turned.normal)
+        assert min(abs(se2.wrap(np.array(found) - turn))) < TURN_STEP
+        assert len(found) <= 6

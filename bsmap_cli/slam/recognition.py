@@ -30,6 +30,8 @@ WITNESS_WAYS, FEWEST_WITNESSES = np.array([-9.0, -6.0, -3.0, 3.0, 6.0, 9.0]), 2
 TRIES, PLACE_SPACING, ALIKE = 6, 2.0, 5
 """Places after a break that are looked for, metres of way between them and between those they are compared with, and
 how many of these, the most alike, are matched."""
+PLACE_SPAN, TURN_STEP, TURNS = 1.2, 2 * np.pi / 48, 6
+"""Metres about a place within which the other is sought; radians between turns, and how many of these are tried."""
 FINGER_POINTS, FINGER_REACH, DISTANCES, ANGLES = 120, 8.0, 16, 4
 """Points of a fingerprint, metres between two of them at the most, and its bins."""
 
@@ -117,14 +119,30 @@ def _recognise(look: Search, start: int, after: int) -> Edges:
         source = source_map(look, key)
         apart = np.abs(prints - fingerprint(source)).sum(axis=1)
         for k in np.argsort(apart, kind="stable")[:ALIKE].tolist():
-            seen = register(source, maps[k], np.zeros(3), look.noise, PLACE_SPACING, np.pi)
-            if seen is None:
+            turns = likely_turns(source.normal, maps[k].points.normal)
+            guesses = [np.array([0.0, 0.0, turn]) for turn in turns]
+            matches = [register(source, maps[k], guess, look.noise, PLACE_SPAN, TURN_STEP) for guess in guesses]
+            best = max((m for m in matches if m is not None), key=lambda m: m.inliers, default=None)
+            if best is None:
                 continue
-            closure = closure_edge(int(places[k]), key, seen)
+            closure = closure_edge(int(places[k]), key, best)
             others = witnesses(look, closure)
             if len(others.first):
                 return joined([closure, others])
     return no_edges()
+
+
+def likely_turns(source: Array, target: Array) -> list[float]:
+    """Radians by which unit normals (n, 2) turn to be spread like others (m, 2): the best of all, and the next."""
+    bins = round(2 * np.pi / TURN_STEP)
+    spread = []
+    for x, y in (source.T, target.T):
+        direction = np.floor(np.arctan2(y, x) / TURN_STEP).astype(int) % bins
+        spread.append(np.bincount(direction, minlength=bins))
+    alike = np.fft.irfft(np.fft.rfft(spread[1]) * np.conj(np.fft.rfft(spread[0])), bins)
+    peak = (alike >= np.roll(alike, 1)) & (alike > np.roll(alike, -1))
+    best = sorted(np.flatnonzero(peak).tolist(), key=lambda k: -alike[k])[:TURNS]
+    return [TURN_STEP * k for k in best]
 
 
 def _spaced(way: Array, keys: IntArray) -> IntArray:

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
+from bsmap_cli.core.gaussian import chi2_gate
 from bsmap_cli.merge.bases import BasedFace
 from bsmap_cli.merge.comparison import Heights, Pair
 from bsmap_cli.model import Decision
@@ -61,7 +61,7 @@ def _said(faces: Sequence[BasedFace], pairs: Sequence[Pair], survey: Mapping[str
 
 def _denied(face: BasedFace, said: Sequence[_Said], distance: float) -> NDArray[np.bool_]:
     """Which samples (n,) more data sets deny than confirm; of as many, those that know better."""
-    gate = float(chi2.ppf(SURE, 1))
+    gate = chi2_gate(SURE, 1)
     votes, surest = np.full(len(face.samples), -len(face.surface.data_sets)), np.full(len(face.samples), np.inf)
     for sets, told in said:
         near = np.abs(told.heights) < distance
@@ -91,7 +91,7 @@ def _is_none(face: BasedFace, said: Sequence[_Said], denied: NDArray[np.bool_], 
     for one in said:
         numbers, h, variance, of_other = (part[np.abs(one.heights.heights) < distance] for part in one.heights)
         if len(h):
-            leans = float(np.mean((h - h.mean()) ** 2 / variance)) > chi2.ppf(SURE, 1)
+            leans = float(np.mean((h - h.mean()) ** 2 / variance)) > chi2_gate(SURE, 1)
             votes += one.sets if leans else -one.sets
             better |= leans and bool(of_other.mean() < face.variances[numbers].mean())
     return votes > 0 or (votes == 0 and better)

@@ -70,9 +70,11 @@ def fitted_variances(poses: Array, lines: Array, sightings: Sightings, covarianc
     row, column = (np.concatenate([place[k] for place in places]) for k in (0, 1))
     shape = (2 * len(centre), 3 * len(poses) + 2 * len(lines))
     A = sparse.csr_matrix((np.concatenate([by_pose.ravel(), by_line.ravel()]), (row, column)), shape)[:, 3:]
-    signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(shape[0], PROBES)) * np.sqrt(both).reshape(-1, 1)
-    found = A @ factors.solve(A.T @ (signs / both.reshape(-1, 1)))
-    return np.maximum((found * signs).mean(axis=1), 0.0).reshape(-1, 2)
+    # Each in units of its deviation, so that those of large variances do not drown the others.
+    deviation = np.sqrt(both).reshape(-1, 1)
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(shape[0], PROBES))
+    found = A @ factors.solve(A.T @ (signs / deviation))
+    return np.maximum((found * signs * deviation).mean(axis=1), 0.0).reshape(-1, 2)
 
 
 def by_parts(

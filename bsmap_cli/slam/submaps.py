@@ -24,7 +24,11 @@ BOLD = (0.5, 0.1)
 
 
 class Search(NamedTuple):
-    """What the search for loops looks at: key scans, their poses and the way to each of them."""
+    """What the search for loops looks at.
+
+    points : of each key scan, in base_link.  poses : (n, 3).  way : (n,) metres driven to each.  noise : metres, of a
+    point's distance to the map.
+    """
 
     points: list[OrientedPoints]
     poses: Array
@@ -33,6 +37,7 @@ class Search(NamedTuple):
 
 
 def no_edges() -> Edges:
+    """A table of edges without any."""
     none = np.zeros(0, int)
     return Edges(none, none, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0, bool))
 
@@ -44,6 +49,7 @@ def agree(a: Array, b: Array) -> NDArray[np.bool_]:
 
 
 def around(centre: int, half: int, count: int) -> range:
+    """Up to `half` key scans to either side of one, of `count` in all."""
     return range(max(centre - half, 0), min(centre + half + 1, count))
 
 
@@ -69,7 +75,10 @@ def small_map(look: Search, centre: int, keys: Sequence[int], step: int = 1) -> 
 def register(
     source: OrientedPoints, target: Target, guess: Array, noise: float, span: float, turn: float
 ) -> Match | None:
-    """Match of two small maps, from the guess; None where they do not agree."""
+    """Match of two small maps, from the guess; None where they do not agree.
+
+    span, turn : metres and radians about the guess that are searched where the match from there fails; no turn: none.
+    """
     loose = np.diag([0.01, 0.01, 0.25])
     found = match(source, target, guess, loose, noise, reach=1.0)
     if found.inliers >= AGREEMENT:

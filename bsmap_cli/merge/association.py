@@ -5,8 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from scipy.stats import chi2
-
+from bsmap_cli.core.gaussian import chi2_gate
 from bsmap_cli.merge.bases import BasedFace
 from bsmap_cli.merge.changes import MOVED
 from bsmap_cli.merge.comparison import Pair, compare, near, prepared
@@ -56,7 +55,7 @@ def associate(faces: Sequence[BasedFace], survey: Mapping[str, int], params: Mer
     ----------
     survey : number of the survey that each surface stems from, by name.
     """
-    gate = float(chi2.ppf(params.gate, 1))
+    gate = chi2_gate(params.gate, 1)
     pairs, groups = _compared(faces, gate, params), _alone(len(faces))
     _keep_apart(groups, pairs, gate, params)
     joined, refused = [], []
@@ -133,7 +132,7 @@ def _with_moved(
     """Refusals, those first and with a reason of their own where something moved: two faces that cover each other at a
     significant offset, of which each survey saw but one.
     """
-    least = float(chi2.ppf(SIGNIFICANT, 1))
+    least = chi2_gate(SIGNIFICANT, 1)
     surveys: dict[int, set[int]] = defaultdict(set)
     for number, face in enumerate(faces):
         surveys[group[number]].add(survey[face.surface.name])

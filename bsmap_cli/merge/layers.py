@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 import shapely
 
-from bsmap_cli.fit.heights import HeightField, evaluate, offset
+from bsmap_cli.fit.heights import HeightField, offset
 from bsmap_cli.merge.bases import places_on
 from bsmap_cli.merge.outlines import Seen
 from bsmap_cli.merge.regions import GRID, LEAST_AREA, Region, parts, region_of, without_specks
@@ -72,16 +72,11 @@ def _overlaps(
         if part.area < LEAST_AREA:
             continue
         points = _places(part, fields[a])
-        apart = np.abs(_above(points, fields[b]))
-        along = np.abs(np.sum(_normals(points, fields[a]) * _normals(points, fields[b]), axis=1))
+        above, normals = offset(fields[b], points)
+        apart, along = np.abs(above), np.abs(np.sum(offset(fields[a], points)[1] * normals, axis=1))
         if apart.min() < CLOSE and apart.max() < distance and along.max() > ALIKE:
             found.append(part)
     return found
-
-
-def _normals(points: Array, field: HeightField) -> Array:
-    """(n, 3) unit normals of a field near points (n, 3)."""
-    return offset(field, points)[1]
 
 
 def _without(region: Region, part: Region) -> Region:
@@ -99,12 +94,6 @@ def _laid(region: Region, field: HeightField, on: HeightField) -> Region:
 def _on(st: Array, field: HeightField) -> Array:
     """(n, 3) points of a field at s and t (n, 2)."""
     return places_on(field, (st - field.low) / (field.high - field.low))
-
-
-def _above(points: Array, field: HeightField) -> Array:
-    """(n,) metres by which points (n, 3) lie above a field."""
-    local = field.base.local(points)
-    return local[:, 2] - evaluate(field, field.parameters(local))[0]
 
 
 def _places(part: Region, field: HeightField) -> Array:

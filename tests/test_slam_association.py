@@ -52,9 +52,8 @@ class World:
         self.order = order if walls is None else np.array(walls)[order]
         count = len(lines)
         covariance = np.tile(np.diag([0.002, 0.005]) ** 2, (count, 1, 1))
-        return Segments(
-            np.zeros(count, int), np.array(lines)[order], covariance, np.array(extents)[order], np.full(count, 50)
-        )
+        none, extents = np.zeros((count, 2)), np.array(extents)[order]
+        return Segments(np.zeros(count, int), np.array(lines)[order], covariance, extents, np.full(count, 50), none)
 
     def candidates(self, segments: Segments, margin: float = MARGIN) -> Candidates:
         return find_candidates(self.state, self.extents, segments, GATE, margin)

@@ -1,5 +1,7 @@
 """Line segments from scans: corners, breaks, fit against the paper's double sums, calibrated covariance."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from reference import polar_line_fit
@@ -154,7 +156,7 @@ def test_clutter_is_no_wall():
 @pytest.mark.parametrize("ranges", [np.zeros((0, 361)), np.full((3, 361), np.nan)])
 def test_no_returns_no_segments(ranges):
     segments = extract(ranges, HALF)
-    assert [np.shape(field) for field in segments] == [(0,), (0, 2), (0, 2, 2), (0, 2), (0,)]
+    assert [np.shape(field) for field in segments] == [(0,), (0, 2), (0, 2, 2), (0, 2), (0,), (0, 2)]
 
 
 def test_scans_do_not_mix_and_are_found_by_number():
@@ -250,3 +252,19 @@ def test_floor_widens_about_the_segment_not_about_the_origin():
     J = np.array([-middle[0], 1.0])  # change of a point's offset with alpha and r
     assert np.sqrt(J @ segments.covariances[0] @ J) < 0.01
     assert np.sqrt(segments.covariances[0, 0, 0]) == pytest.approx(0.1, rel=0.05)
+
+
+def test_angular_variances_are_what_the_noise_of_the_beams_directions_adds():
+    """Scans of a wall with noise in the directions alone, of a laser that has both."""
+    params, rng, trials = replace(BARE, angle_sigma=0.004), np.random.default_rng(3), 1000
+    wall = ((6.0, -2.0), (2.0, 2.0))
+    directions = HALF + params.angle_sigma * rng.normal(size=(trials, len(HALF)))
+    seen = np.stack([cast(d, [wall]) for d in directions])
+    seen[:, ~np.isfinite(cast(HALF, [wall]))] = np.nan
+    segments = extract(seen, HALF, params)
+    assert len(segments.scan) == trials
+    alpha, r = segments.parameters.T
+    centre = segments.covariances[:, 0, 1] / segments.covariances[:, 0, 0]
+    told = segments.angular.mean(axis=0)
+    assert alpha.var() == pytest.approx(told[0], rel=0.15)
+    assert (r - centre.mean() * alpha).var() == pytest.approx(told[1], rel=0.15)

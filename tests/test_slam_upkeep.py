@@ -24,9 +24,9 @@ def stored(lines: list, extents: list, hits: int = 5) -> tuple[filter.FilterStat
 
 def segments_of(lines: list, extents: list) -> Segments:
     k = len(lines)
-    return Segments(
-        np.zeros(k, int), np.array(lines, float), np.tile(SIGMA, (k, 1, 1)), np.array(extents, float), np.full(k, 50)
-    )
+    covariances, none = np.tile(SIGMA, (k, 1, 1)), np.zeros((k, 2))
+    extents = np.array(extents, float)
+    return Segments(np.zeros(k, int), np.array(lines, float), covariances, extents, np.full(k, 50), none)
 
 
 def join(state: filter.FilterState, landmarks: upkeep.Landmarks, touched: list | None = None):

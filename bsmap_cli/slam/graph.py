@@ -6,8 +6,17 @@ import numpy as np
 
 from bsmap_cli.core import se2
 from bsmap_cli.core.table import joined, take
-from bsmap_cli.model import Array, IntArray, LineMap, LoopClosures, ScanLog, SlamMap, StepStatistics, Trajectory
+from bsmap_cli.model import (
+    IntArray,
+    LineMap,
+    LoopClosures,
+    ScanLog,
+    SlamMap,
+    StepStatistics,
+    Trajectory,
+)
 from bsmap_cli.params import SlamParams
+from bsmap_cli.slam.between import evenly, every_scan
 from bsmap_cli.slam.latency import lined_up, odometry_delay
 from bsmap_cli.slam.lines import MappedLines, map_lines
 from bsmap_cli.slam.loops import Closures, close_loops, is_loop
@@ -16,7 +25,6 @@ from bsmap_cli.slam.motion import beam_motion, odometry_motion
 from bsmap_cli.slam.posegraph import Edges
 from bsmap_cli.slam.segments import Segments, extract_segments, scan_batches
 from bsmap_cli.slam.smoothing import Evidence, Smoothed, smooth
-from bsmap_cli.slam.submaps import agree
 from bsmap_cli.slam.tracking import MATCH_FLOOR, Tracking, limited, track_scans
 from bsmap_cli.slam.upkeep import with_positive_offset
 from bsmap_cli.track import Track
@@ -26,24 +34,23 @@ logger = logging.getLogger("bsmap")
 NO_ODOMETRY = np.array([0.1, 0.1, 0.05])
 ODOMETRY_FLOOR = np.array([0.003, 0.003, 0.002])
 """Metres and radians by which a step between key scans may be off: as it was tracked, and by odometry at the least."""
-OWN_SHARE, OWN_FLOOR = np.array([0.22, 0.22, 0.38]), np.array([0.0003, 0.0003, 0.0001])
-"""Of the standard deviation of a step, what a single match errs by, and that at the least (metres, radians); the rest
-of a step's allows for what neighbours have in common."""
 
 
 def run_graph(log: ScanLog, range_sigma: float, params: SlamParams, track: Track) -> SlamMap:
     """Trajectory and line map by matching, loop closing, the line filter and smoothing of all of it."""
     log, tracking = _tracked(log, range_sigma, params, track)
+    if log.odometry is not None:
+        tracking = evenly(tracking, log.odometry)
     closures = close_loops(tracking, range_sigma, track)
-    segments = _key_segments(log, tracking.keys, range_sigma, params)
+    segments = _key_segments(log, tracking, range_sigma, params)
     mapped = map_lines(closures.poses, segments, params)
     every = Evidence(closures.chain, closures.closures)
     odometry = _odometry_edges(log, tracking, closures.chain, params)
     distinct = Evidence(odometry, _unexplained(log, tracking, closures, segments))
     smoothed = smooth(closures.poses, every, distinct, segments, mapped.lines, params)
     known = marginals(smoothed.information, len(smoothed.poses), len(smoothed.lines))
-    trajectory = Trajectory(log.horizontal.time_ns, *_every_scan(tracking, smoothed.poses, known))
     scans = log.horizontal
+    trajectory = Trajectory(scans.time_ns, *every_scan(scans, tracking, smoothed, known, odometry))
     statistics = _statistics(mapped, tracking.keys, len(scans.time_ns))
     return SlamMap(
         trajectory,
@@ -71,11 +78,11 @@ def _tracked(log: ScanLog, range_sigma: float, params: SlamParams, track: Track)
     return log, track_scans(log, range_sigma, params, track)
 
 
-def _key_segments(log: ScanLog, keys: IntArray, range_sigma: float, params: SlamParams) -> Segments:
+def _key_segments(log: ScanLog, tracking: Tracking, range_sigma: float, params: SlamParams) -> Segments:
     """Segments of the key scans; `scan` counts key scans."""
     scans = log.horizontal
     laser = se2.from_matrix(scans.mount)[:2]
-    batches = scan_batches(scans, keys, beam_motion(log))
+    batches = scan_batches(scans, tracking.keys, beam_motion(scans, tracking.poses))
     return joined([extract_segments(points, laser, range_sigma, params) for _, points in batches])
 
 
@@ -108,49 +115,6 @@ def _unexplained(log: ScanLog, tracking: Tracking, closures: Closures, segments:
     information[failed] = 0.0
     matches = chain._replace(information=limited(information, MATCH_FLOOR))
     return joined([matches, closures.closures])
-
-
-def _every_scan(tracking: Tracking, poses: Array, known: Marginals) -> tuple[Array, Array, Array]:
-    """Poses (n, 3), covariances (n, 3, 3) and modes (n, 3, k) of all scans from those of the key scans.
-
-    Between two key scans the tracked motion is kept; what it misses of the way to the second one is spread over it,
-    unless it is a break: then all follow the first. So the error is a share of either key scan's, which are correlated,
-    and of the match's own.
-    """
-    n, keys, tracked = len(tracking.poses), tracking.keys, tracking.poses
-    before = np.searchsorted(keys, np.arange(n), side="right") - 1
-    after = np.minimum(before + 1, len(keys) - 1)
-    forward = se2.compose(poses[before], se2.between(tracked[keys[before]], tracked))
-    backward = se2.compose(poses[after], se2.between(tracked[keys[after]], tracked))
-    span = np.maximum(keys[after] - keys[before], 1)
-    share = np.where((after > before) & agree(forward, backward), (np.arange(n) - keys[before]) / span, 0.0)[:, None]
-    miss = backward - forward
-    miss[:, 2] = se2.wrap(miss[:, 2])
-    every = forward + share * miss
-    every[:, 2] = se2.wrap(every[:, 2])
-    first, second = 1.0 - share[..., None], share[..., None]
-    cross = known.following[before] + np.swapaxes(known.following[before], 1, 2)
-    spread = first**2 * known.poses[before] + second**2 * known.poses[after] + first * second * cross
-    between = (share[:, 0] > 0) & (share[:, 0] < 1)
-    spread[between] += _match_covariances(tracking, every[between, 2], before[between])
-    return every, spread, first * known.modes[before] + second * known.modes[after]
-
-
-def _match_covariances(tracking: Tracking, heading: Array, key: IntArray) -> Array:
-    """(k, 3, 3) in map, of the tracked place of scans at `heading` (k,) after key scans `key` (k,) beside these.
-
-    That of a step from key scan to key scan, less its allowances for what neighbouring matches have in common.
-    """
-    common = np.diag(MATCH_FLOOR**2)
-    own = np.linalg.inv(tracking.edges.information[key]) - common
-    step = own * np.outer(OWN_SHARE, OWN_SHARE) + np.diag(OWN_FLOOR**2)
-    R = np.zeros((len(key), 3, 3))
-    R[:, 0, 0] = R[:, 1, 1] = np.cos(heading)
-    R[:, 1, 0] = np.sin(heading)
-    R[:, 0, 1] = -R[:, 1, 0]
-    R[:, 2, 2] = 1.0
-    spread = R @ step @ np.swapaxes(R, 1, 2)
-    return (spread + np.swapaxes(spread, 1, 2)) / 2
 
 
 def _loops(closures: Closures, tracking: Tracking) -> LoopClosures:

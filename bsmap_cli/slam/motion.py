@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bsmap_cli.core import se2
-from bsmap_cli.model import Array, ScanLog
+from bsmap_cli.model import Array, LaserScans
 from bsmap_cli.params import SlamParams
 
 MAX_SPEED = 3.0
@@ -80,14 +80,13 @@ def constant_velocity(last: Array, last_seconds: float, seconds: float, params: 
     return Motion(last * ratio, np.diag([spread, spread, spread]) ** 2)
 
 
-def beam_motion(log: ScanLog) -> Array:
-    """(n, 3) motion of base_link from one beam of a horizontal scan to the next, by the odometry; else 0."""
-    scans = log.horizontal
+def beam_motion(scans: LaserScans, poses: Array | None) -> Array:
+    """(n, 3) motion of base_link from one beam of a horizontal scan to the next, by the `poses` (n, 3); else 0."""
     n = len(scans.time_ns)
-    if log.odometry is None or scans.time_increment == 0.0 or n < 2:
+    if poses is None or scans.time_increment == 0.0 or n < 2:
         return np.zeros((n, 3))
     seconds = np.diff(scans.time_ns) * 1e-9
-    step = se2.between(log.odometry[:-1], log.odometry[1:])
+    step = se2.between(poses[:-1], poses[1:])
     with np.errstate(divide="ignore", invalid="ignore"):
         velocity = step / seconds[:, None]
     sane = (seconds > 0) & (np.hypot(*velocity[:, :2].T) < MAX_SPEED) & (np.abs(velocity[:, 2]) < MAX_TURN_RATE)

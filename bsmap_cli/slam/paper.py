@@ -121,7 +121,7 @@ def _segments(log: ScanLog, range_sigma: float, params: SlamParams) -> Iterator[
     """Segments of each horizontal scan in turn."""
     scans = log.horizontal
     laser = se2.from_matrix(scans.mount)[:2]
-    for some, points in scan_batches(scans, np.arange(len(scans.time_ns)), beam_motion(log)):
+    for some, points in scan_batches(scans, np.arange(len(scans.time_ns)), beam_motion(scans, log.odometry)):
         found = extract_segments(points, laser, range_sigma, params)
         for k in some:
             yield found.of_scan(k)

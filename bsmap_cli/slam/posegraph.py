@@ -62,17 +62,30 @@ def weighted(edges: Edges, error: Array) -> tuple[Array, Array]:
     return distance, edges.information * weight[:, None, None]
 
 
-@lru_cache
-def robust_means(freedom: int) -> tuple[float, float]:
-    """Means of the robust weight w and of w d, where the squared distance d is chi-square with so much freedom.
+class RobustMeans(NamedTuple):
+    """Of errors that are as their covariances tell: means of the robust weight w, and of w times the squared distance.
 
-    By Gauss-Laguerre quadrature. Errors that are as the covariance tells lose weight too: without these means a
-    variance that is found by weighted squares comes out too small.
+    gain : information of what robust least squares finds, over that of the weighted observations (Huber 1981, 7.6).
+    """
+
+    weight: float
+    distance: float
+    gain: float
+
+
+@lru_cache
+def robust_means(freedom: int) -> RobustMeans:
+    """Means where the squared distance d is chi-square with so much freedom, by Gauss-Laguerre quadrature.
+
+    Errors that are as the covariance tells lose weight too: without these means a variance that is found by weighted
+    squares comes out too small, and the covariance of poses too large.
     """
     nodes, shares = roots_genlaguerre(40, freedom / 2 - 1)
     distance, shares = 2 * nodes, shares / shares.sum()
     weight = 1.0 / (1.0 + distance / ROBUST_WIDTH)
-    return float(shares @ weight), float(shares @ (weight * distance))
+    mean, slope = float(shares @ weight), shares @ (weight - 2 * weight**2 * distance / ROBUST_WIDTH / freedom)
+    scatter = shares @ (weight**2 * distance) / freedom
+    return RobustMeans(mean, float(shares @ (weight * distance)), float(slope**2 / (scatter * mean)))
 
 
 class Term(NamedTuple):
@@ -81,6 +94,7 @@ class Term(NamedTuple):
     blocks : (rows, columns, values (k, a, b)) of the matrix.  sides : (rows, values (k, a)) of the right-hand side.
     distance : sum of the weighted squared Mahalanobis distances.  observations : their number, weighted.
     share : of the distance that the weights leave, for each observation, where errors are as the covariances tell.
+    gain : see `RobustMeans`.
     """
 
     blocks: list[tuple[IntArray, IntArray, Array]]
@@ -88,6 +102,7 @@ class Term(NamedTuple):
     distance: float
     observations: float
     share: float
+    gain: float
 
 
 def edge_term(poses: Array, edges: Edges) -> Term:
@@ -106,10 +121,9 @@ def edge_term(poses: Array, edges: Edges) -> Term:
     ]
     sides = [(i, -np.einsum("mij,mj->mi", first_w, error)), (j, -np.einsum("mij,mj->mi", second_w, error))]
     total = float(weight.sum())
-    mean, mean_distance = robust_means(3)
-    robust = float(weight[edges.robust].sum()) / max(total, 1e-300)
-    share = 1.0 - robust * (1.0 - mean_distance / (3 * mean))
-    return Term(blocks, sides, float(weight @ distance), 3 * total, share)
+    means, robust = robust_means(3), float(weight[edges.robust].sum()) / max(total, 1e-300)
+    share = 1.0 - robust * (1.0 - means.distance / (3 * means.weight))
+    return Term(blocks, sides, float(weight @ distance), 3 * total, share, 1.0 + robust * (means.gain - 1.0))
 
 
 def term_matrix(term: Term, size: int) -> sparse.csc_matrix:

@@ -1,8 +1,8 @@
 """How much each sighting of a line counts, as what is left of the errors tells: variance components.
 
 The covariance of a segment is that of the noise of its points and a floor, for no wall is flat (method.md section 1).
-How large either really is differs from building to building; and single lines, such as chords of a curved wall, scatter
-more than the others.
+How large either really is differs from laser to laser and from building to building; and single lines, such as chords
+of a curved wall, scatter more than the others.
 """
 
 import numpy as np
@@ -10,7 +10,7 @@ from scipy import sparse
 from scipy.optimize import nnls
 from scipy.sparse.linalg import SuperLU
 
-from bsmap_cli.model import Array
+from bsmap_cli.model import Array, IntArray
 from bsmap_cli.slam.posegraph import ROBUST_WIDTH, entries, robust_means
 from bsmap_cli.slam.segments import Segments
 from bsmap_cli.slam.sightings import Sightings, derivatives, errors
@@ -21,25 +21,42 @@ OFTEN = 5
 """Sightings from which on a line tells of its errors: one seen less often follows them."""
 FEWEST = 50
 """Sightings of such lines without which the covariances stay as they are."""
-LEAST_FLOOR = 0.05
-"""Of the variance of the floor, what is kept: a bump in a wall is the same in every scan, so that nothing shows it."""
-ROUNDS, PROBES = 5, 16
+LEAST_NOISE = LEAST_FLOOR = 0.02
+"""Of the variances of noise and of the floor, what is kept: a bump in a wall is the same in every scan, so that nothing
+shows it."""
+LEAST_LEFT = 0.05
+"""Share of a variance that an error must still have, however much was fitted to it."""
+ROUNDS, STEPS, PROBES = 3, 5, 16
+"""Of all lines' scales and single lines' in turn; of either in itself; random vectors for the diagonal of an inverse.
+"""
 
 
 def weighed(
-    poses: Array, lines: Array, sightings: Sightings, segments: Segments, floors: Array, factors: SuperLU | None
+    poses: Array, lines: Array, sightings: Sightings, segments: Segments, floors: Array, factors: SuperLU
 ) -> Sightings:
     """Sightings with the information that their errors at `poses` (n, 3) and `lines` (m, 2) bear out.
 
-    floors : (2,) standard deviations of the floors, in direction and in the middle of a segment: radians, metres.
-    factors : of the information of all poses but the first and all lines, as these were found; None where they were
-    not fitted to the sightings yet, so that nothing is told by these: they stay as they are.
+    sightings : with the information by which poses and lines were found.  floors : (2,) standard deviations of the
+    floors, in direction and in the middle of a segment: radians, metres.  factors : of the information of all poses but
+    the first and all lines.
     """
-    if factors is None:
-        return sightings
-    covariance = segments.covariances[sightings.segment]
-    fitted = fitted_variances(poses, lines, sightings, covariance, factors)
-    return by_scatter(poses, lines, by_parts(poses, lines, sightings, covariance, floors, fitted), fitted)
+    centre, told = centred(segments.covariances[sightings.segment])
+    parts = variance_parts(told, segments.angular[sightings.segment], floors)
+    squares = centred_errors(poses, lines, sightings, centre) ** 2
+    left = left_over(poses, lines, sightings, centre, factors)
+    often = np.bincount(sightings.line, minlength=len(lines))[sightings.line] >= OFTEN
+    telling = often & ~sightings.rival.any(axis=1)
+    scales, own = np.ones(len(parts)), np.ones(len(lines))
+    for _ in range(ROUNDS):
+        if np.count_nonzero(telling) >= FEWEST:
+            each = own[sightings.line][telling, None]
+            scales = by_parts(squares[telling], left[telling], parts[:, telling] * each)
+        variances = np.tensordot(scales, parts, axes=1)
+        own = by_scatter(squares, left, variances, sightings.line, len(lines))
+    along, middle = 1.0 / (variances * own[sightings.line, None] + sightings.rival).T
+    # With offset = r - centre * alpha, the information of (alpha, offset), which is diagonal, as that of (alpha, r).
+    information = np.stack([along + centre**2 * middle, -centre * middle, -centre * middle, middle], axis=1)
+    return sightings._replace(information=information.reshape(-1, 2, 2))
 
 
 def centred(covariance: Array) -> tuple[Array, Array]:
@@ -55,13 +72,21 @@ def centred_errors(poses: Array, lines: Array, sightings: Sightings, centre: Arr
     return error
 
 
-def fitted_variances(poses: Array, lines: Array, sightings: Sightings, covariance: Array, factors: SuperLU) -> Array:
-    """(m, 2) variances, centred, of what poses and lines make of each sighting: those its error at them lacks.
+def variance_parts(told: Array, angular: Array, floors: Array) -> Array:
+    """(3, m, 2) variances by the noise of ranges, by that of the beams' directions, and by the floor.
 
-    For they were fitted to it (the leverage of regression). The diagonal of A N^-1 A' by random vectors of signs
-    (Bekas, Kokiopoulou and Saad 2007); the seed is fixed, so that the same data give the same variances.
+    told, angular : (m, 2) of all, and by the beams' directions.  floors : (2,) standard deviations.
     """
-    centre, both = centred(covariance)
+    floor = np.minimum(floors**2, told)
+    return np.stack([np.maximum(told - floor - angular, 0.0), angular, floor])
+
+
+def left_over(poses: Array, lines: Array, sightings: Sightings, centre: Array, factors: SuperLU) -> Array:
+    """(m, 2) share of its variance that each error still has: one less its leverage, for poses and lines were fitted.
+
+    The diagonal of A N^-1 A' by random vectors of signs (Bekas, Kokiopoulou and Saad 2007), over the variances that
+    made N; the seed is fixed, so that the same data give the same shares.
+    """
     by_pose, by_line = derivatives(poses, lines, sightings)
     for part in (by_pose, by_line):
         part[:, 1] -= centre[:, None] * part[:, 0]
@@ -70,63 +95,48 @@ def fitted_variances(poses: Array, lines: Array, sightings: Sightings, covarianc
     row, column = (np.concatenate([place[k] for place in places]) for k in (0, 1))
     shape = (2 * len(centre), 3 * len(poses) + 2 * len(lines))
     A = sparse.csr_matrix((np.concatenate([by_pose.ravel(), by_line.ravel()]), (row, column)), shape)[:, 3:]
+    variances = centred(np.asarray(np.linalg.inv(sightings.information), dtype=np.float64))[1]
     # Each in units of its deviation, so that those of large variances do not drown the others.
-    deviation = np.sqrt(both).reshape(-1, 1)
+    deviation = np.sqrt(variances).reshape(-1, 1)
     signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(shape[0], PROBES))
-    found = A @ factors.solve(A.T @ (signs / deviation))
-    return np.maximum((found * signs * deviation).mean(axis=1), 0.0).reshape(-1, 2)
+    fitted = (A @ factors.solve(A.T @ (signs / deviation)) * signs / deviation).mean(axis=1).reshape(-1, 2)
+    # Robust weights made N smaller by their mean.
+    return np.clip(1.0 - robust_means(2).weight * fitted, LEAST_LEFT, 1.0)
 
 
-def by_parts(
-    poses: Array, lines: Array, sightings: Sightings, covariance: Array, floors: Array, fitted: Array
-) -> Sightings:
-    """With noise and floor each as large as the errors of all sightings tell.
+def by_parts(squares: Array, left: Array, parts: Array) -> Array:
+    """(3,) scales of the parts of the variances, each as large as the errors of all sightings tell.
 
-    Where its points are centred, direction and offset of a segment are independent: there each has a variance that is
-    a sum of both parts, and a regression of the squared errors on these gives their scales.
+    A regression of the squared errors, robust, on the shares of the parts in their variances.
 
-    covariance : (m, 2, 2), of the segments.  fitted : (m, 2), variances that the errors lack.
+    squares : (m, 2) of the centred errors.  left : (m, 2), see `left_over`.  parts : (3, m, 2) variances.
     """
-    centre, both = centred(covariance)
-    floor = np.minimum(floors**2, both)
-    noise = both - floor
-    often = np.bincount(sightings.line, minlength=len(lines))[sightings.line] >= OFTEN
-    if np.count_nonzero(often) < FEWEST:
-        return sightings
-    squares = (centred_errors(poses, lines, sightings, centre) ** 2 + fitted)[often]
-    scales = np.ones(2)
-    for _ in range(ROUNDS):
-        now = (scales[0] * noise + scales[1] * floor)[often]
-        distance = squares / now
-        distance /= 1.0 + distance / ROBUST_WIDTH
-        parts = np.stack([(noise[often] / now).ravel(), (floor[often] / now).ravel()], axis=1)
-        scales = nnls(parts, distance.ravel() / robust_means(1)[1])[0]
-        scales = np.maximum(scales, [LEAST_FLOOR, LEAST_FLOOR * max(1.0, scales[0])])
-    along, middle = 1.0 / (scales[0] * noise + scales[1] * floor).T
-    # With offset = r - centre * alpha, the information of (alpha, offset), which is diagonal, as that of (alpha, r).
-    information = np.stack([along + centre**2 * middle, -centre * middle, -centre * middle, middle], axis=1)
-    return sightings._replace(information=information.reshape(-1, 2, 2))
+    scales = np.ones(len(parts))
+    for _ in range(STEPS):
+        now = np.tensordot(scales, parts, axes=1)
+        distance = squares / (now * left)
+        distance *= left / (1.0 + distance / ROBUST_WIDTH)
+        shares = (parts * left / now).reshape(len(parts), -1)
+        scales = nnls(shares.T, distance.ravel() / robust_means(1).distance)[0]
+        scales[0] = max(scales[0], LEAST_NOISE)
+        scales[2] = max(scales[2], LEAST_FLOOR * max(1.0, scales[0]))
+    return scales
 
 
-def by_scatter(poses: Array, lines: Array, sightings: Sightings, fitted: Array) -> Sightings:
-    """With less information for lines whose sightings agree less than those of the others do.
+def by_scatter(squares: Array, left: Array, variances: Array, line: IntArray, count: int) -> Array:
+    """(count,) factors of the variances of lines whose sightings agree less than those of the others do.
 
     A chord of a curved wall or an edge of clutter is another one in every scan; the noise of its points does not tell
     that, what is left of its errors does. Each line gets a variance of its own where that is above the common one,
     drawn towards it by PRIOR_FREEDOM, less what chance may do (its standard deviation).
 
-    fitted : (m, 2), variances that the errors lack.
+    squares, left : (m, 2) as for `by_parts`.  variances : (m, 2).  line : (m,), below `count`.
     """
-    centre, variances = centred(np.asarray(np.linalg.inv(sightings.information), dtype=np.float64))
-    squares = centred_errors(poses, lines, sightings, centre) ** 2 + fitted
-    own = np.ones(len(lines))
-    freedom = 2.0 * np.bincount(sightings.line, minlength=len(lines))
-    for _ in range(3):
-        distance = (squares / variances).sum(axis=1) / own[sightings.line]
-        distance /= 1.0 + distance / ROBUST_WIDTH
-        common = distance.sum() / max(2.0 * len(distance), 1.0)
-        each = np.bincount(sightings.line, weights=distance, minlength=len(lines))
-        own *= (each + PRIOR_FREEDOM * common) / ((freedom + PRIOR_FREEDOM) * max(common, 1e-12))
-        own = np.maximum(own, 1.0)
-    own = np.maximum(own / (1.0 + np.sqrt(2.0 / (freedom + PRIOR_FREEDOM))), 1.0)
-    return sightings._replace(information=sightings.information / own[sightings.line, None, None])
+    freedom = np.bincount(line, weights=left.sum(axis=1), minlength=count) + PRIOR_FREEDOM
+    own = np.ones(count)
+    for _ in range(STEPS):
+        distance = (squares / (variances * left)).sum(axis=1) / own[line]
+        distance *= left.sum(axis=1) / (1.0 + distance / ROBUST_WIDTH) / robust_means(2).distance
+        each = np.bincount(line, weights=distance, minlength=count)
+        own = np.maximum(own * (each + PRIOR_FREEDOM) / freedom, 1.0)
+    return np.maximum(own / (1.0 + np.sqrt(2.0 / freedom)), 1.0)

@@ -40,7 +40,8 @@ class Segments(NamedTuple):
 
     scan : (k,), ascending.  parameters : (k, 2) alpha, r (below 0 where the line passes between laser and base_link's
     origin).  covariances : (k, 2, 2).  extents : (k, 2) along t = (-sin alpha, cos alpha), metres.
-    points : (k,) number.
+    points : (k,) number.  angular : (k, 2), what the noise of the beams' directions adds to the variances of direction
+    and, where the points are centred, offset.
     """
 
     scan: IntArray
@@ -48,6 +49,7 @@ class Segments(NamedTuple):
     covariances: Array
     extents: Array
     points: IntArray
+    angular: Array
 
     def of_scan(self, scan: int) -> "Segments":
         """The segments of one scan."""
@@ -222,9 +224,8 @@ def _fit(
         n = np.stack([np.cos(alpha), np.sin(alpha)], axis=1)
         along = np.einsum("ij,ij->i", n[owner], direction)
         across = n[owner, 1] * direction[:, 0] - n[owner, 0] * direction[:, 1]
-        weight = 1.0 / (
-            (range_sigma * along) ** 2 + (params.angle_sigma * rho * across) ** 2 + (0.1 * range_sigma) ** 2
-        )
+        by_angle = (params.angle_sigma * rho * across) ** 2
+        weight = 1.0 / ((range_sigma * along) ** 2 + by_angle + (0.1 * range_sigma) ** 2)
     # n points away from the laser, so that the two faces of a thin wall differ by pi.
     flip = np.einsum("ij,ij->i", mean - laser_xy, n) < 0
     alpha = np.where(flip, alpha + np.pi, alpha)
@@ -236,16 +237,19 @@ def _fit(
     # Noise larger than told (a rough wall, another surface) widens the covariance instead of being believed.
     scale = np.maximum(1.0, chi2 / np.maximum(count - 2, 1))
     centre = np.einsum("ij,ij->i", mean, t)
-    var_alpha = scale / total(weight * s**2)
+    sum_ss = total(weight * s**2)
+    var_alpha = scale / sum_ss
     var_r = scale / sum_w + centre**2 * var_alpha
     covariance = np.empty((len(start), 2, 2))
     covariance[:, 0, 0] = var_alpha + params.line_angle_floor**2
     covariance[:, 1, 1] = var_r + params.line_offset_floor**2 + (centre * params.line_angle_floor) ** 2
     covariance[:, 0, 1] = covariance[:, 1, 0] = centre * (var_alpha + params.line_angle_floor**2)
+    share = weight**2 * by_angle
+    angular = np.stack([total(share * s**2) / sum_ss**2, total(share) / sum_w**2], axis=1) * scale[:, None]
     r = np.einsum("ij,ij->i", mean, n)
     low = np.minimum.reduceat(s, first) if len(first) else np.zeros(0)
     high = np.maximum.reduceat(s, first) if len(first) else np.zeros(0)
     extents = np.stack([centre + low, centre + high], axis=1)
     keep = (high - low >= params.min_length) & (chi2 < 9.0 * count)
-    segments = Segments(points.scan[start], np.stack([alpha, r], axis=1), covariance, extents, count)
+    segments = Segments(points.scan[start], np.stack([alpha, r], axis=1), covariance, extents, count, angular)
     return take(segments, keep)

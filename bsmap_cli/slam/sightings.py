@@ -12,12 +12,15 @@ from bsmap_cli.slam.segments import Segments
 
 AT_ONCE = 100
 """Segments compared with all lines at a time."""
+MOST_TURN = 0.2
+"""Radians between a segment and a line that it may be part of."""
 
 
 class Sightings(NamedTuple):
     """Lines seen from key poses. pose, line : (m,).  observed : (m, 2) alpha, r in base_link.  information : (m, 2, 2).
 
-    segment : (m,), which of the segments it is.
+    segment : (m,), which of the segments it is.  rival : (m, 2) squared distances, in direction and offset at the
+    segment's centre, to the line farthest from this one that it may be as well; 0 where there is none.
     """
 
     pose: IntArray
@@ -25,6 +28,7 @@ class Sightings(NamedTuple):
     observed: Array
     information: Array
     segment: IntArray
+    rival: Array
 
 
 def match_all(
@@ -46,7 +50,8 @@ def match_all(
     near = np.concatenate([none, *(part[2] for part in found)]) < chi2_gate(gate, 2)
     segment, line = segment[near], line[near]
     information = np.linalg.inv(segments.covariances[segment])
-    return Sightings(segments.scan[segment], line, segments.parameters[segment], information, segment)
+    none = np.zeros((len(segment), 2))
+    return Sightings(segments.scan[segment], line, segments.parameters[segment], information, segment, none)
 
 
 def _match_some(
@@ -59,22 +64,61 @@ def _match_some(
     spread: tuple[float, float],
 ) -> tuple[IntArray, IntArray, Array]:
     """Segments of `rows` that lie beside a line, that line, and the squared distance."""
+    a, b, turn, apart = _beside(poses, lines, extents, segments, rows, margin)
+    # Compared in the middle of the segment, where direction and offset are nearly independent.
+    C, middle = segments.covariances[rows[a]], segments.extents[rows[a]].mean(axis=1)
+    offset_variance = C[:, 1, 1] - 2 * middle * C[:, 0, 1] + middle**2 * C[:, 0, 0] + spread[0] ** 2
+    distance = turn**2 / (C[:, 0, 0] + spread[1] ** 2) + apart**2 / offset_variance
+    order = np.lexsort((distance, a))
+    nearest = order[np.diff(a[order], prepend=-1) > 0]
+    return rows[a[nearest]], b[nearest], distance[nearest]
+
+
+def _beside(
+    poses: Array, lines: Array, extents: Array, segments: Segments, rows: IntArray, margin: float
+) -> tuple[IntArray, IntArray, Array, Array]:
+    """Pairs of segments among `rows` and lines that lie side by side: which of either, (k,).
+
+    And how far apart they are: in direction (k,), and in the middle of the segment (k,).
+    """
     pose, seen = poses[segments.scan[rows]], segments.parameters[rows]
     in_map = extents_of(pose, seen, segments.extents[rows])
     turn = se2.wrap(seen[:, None, 0] + pose[:, None, 2] - lines[None, :, 0])
     overlap = np.minimum(in_map[:, None, 1], extents[None, :, 1]) - np.maximum(in_map[:, None, 0], extents[None, :, 0])
-    a, b = np.nonzero((np.abs(turn) < 0.2) & (overlap > -margin))
+    a, b = np.nonzero((np.abs(turn) < MOST_TURN) & (overlap > -margin))
     alpha = lines[b, 0]
     r = lines[b, 1] - pose[a, 0] * np.cos(alpha) - pose[a, 1] * np.sin(alpha)
-    # Compared in the middle of the segment, where direction and offset are nearly independent.
     middle = segments.extents[rows[a]].mean(axis=1)
-    apart = seen[a, 1] - r - turn[a, b] * middle
-    C = segments.covariances[rows[a]]
-    offset_variance = C[:, 1, 1] - 2 * middle * C[:, 0, 1] + middle**2 * C[:, 0, 0] + spread[0] ** 2
-    distance = turn[a, b] ** 2 / (C[:, 0, 0] + spread[1] ** 2) + apart**2 / offset_variance
-    order = np.lexsort((distance, a))
-    nearest = order[np.diff(a[order], prepend=-1) > 0]
-    return rows[a[nearest]], b[nearest], distance[nearest]
+    return a, b, turn[a, b], seen[a, 1] - r - turn[a, b] * middle
+
+
+def with_rivals(
+    poses: Array, lines: Array, extents: Array, sightings: Sightings, segments: Segments, gate: float, margin: float
+) -> Sightings:
+    """Sightings that tell how far off they are if their segments belong to other lines that explain them as well.
+
+    Along a curved wall a segment lies between the chords that were mapped. Poses that are off have it paired with
+    another of these, to which it then is as near: what it says of the poses is no surer than the chords are apart.
+
+    gate : quantile within which a line that is farther away may still be the true one.
+    """
+    limit = chi2_gate(gate, 2)
+    rival = np.zeros((len(sightings.segment), 2))
+    variances = np.linalg.inv(sightings.information)
+    for start in range(0, len(rival), AT_ONCE):
+        some = slice(start, start + AT_ONCE)
+        rows, C = sightings.segment[some], variances[some]
+        a, b, turn, apart = _beside(poses, lines, extents, segments, rows, margin)
+        middle = segments.extents[rows].mean(axis=1)
+        offset = C[:, 1, 1] - 2 * middle * C[:, 0, 1] + middle**2 * C[:, 0, 0]
+        distance = turn**2 / C[a, 0, 0] + apart**2 / offset[a]
+        own = np.full((3, len(rows)), np.inf)
+        mine = b == sightings.line[some][a]
+        own[:, a[mine]] = distance[mine], turn[mine], apart[mine]
+        near = np.isfinite(own[0, a]) & (distance < own[0, a] + limit)
+        for k, difference in enumerate((turn - own[1, a], apart - own[2, a])):
+            np.maximum.at(rival[some, k], a[near], difference[near] ** 2)
+    return sightings._replace(rival=rival)
 
 
 def extents_of(poses: Array, parameters: Array, extents: Array) -> Array:
@@ -120,8 +164,9 @@ def sighting_term(poses: Array, lines: Array, sightings: Sightings) -> Term:
         (j, i, np.swapaxes(cross, 1, 2)),
     ]
     sides = [(i, -np.einsum("mij,mj->mi", pose_w, error)), (j, -np.einsum("mij,mj->mi", line_w, error))]
-    mean, mean_distance = robust_means(2)
-    return Term(blocks, sides, float(weight @ distance), 2 * float(weight.sum()), mean_distance / (2 * mean))
+    means = robust_means(2)
+    share = means.distance / (2 * means.weight)
+    return Term(blocks, sides, float(weight @ distance), 2 * float(weight.sum()), share, means.gain)
 
 
 def extents_and_hits(poses: Array, lines: Array, sightings: Sightings, segments: Segments) -> tuple[Array, IntArray]:

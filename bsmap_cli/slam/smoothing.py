@@ -18,7 +18,7 @@ from bsmap_cli.slam import posegraph
 from bsmap_cli.slam.posegraph import Edges, Term
 from bsmap_cli.slam.scatter import weighed
 from bsmap_cli.slam.segments import Segments
-from bsmap_cli.slam.sightings import Sightings, extents_and_hits, match_all, sighting_term
+from bsmap_cli.slam.sightings import Sightings, extents_and_hits, match_all, sighting_term, with_rivals
 
 ITERATIONS, HONEST_ITERATIONS = (3, 3, 5), 5
 """Steps of Gauss-Newton after each matching of segments to lines; of the variances at the poses found."""
@@ -38,7 +38,7 @@ class Smoothed(NamedTuple):
     """poses : (n, 3).  lines : (m, 2) alpha, r with n pointing away from where the robot saw them.
 
     extents : (m, 2).  hits : (m,) key scans that saw the line.  information : sparse, of all poses and lines but the
-    first pose, which is held.  scales : (3,) of the variances of steps, closures and lines in it.
+    first pose, which is held.  scales : (2,) of the variances of steps and closures in it.
     """
 
     poses: Array
@@ -64,11 +64,10 @@ class _Problem(NamedTuple):
     sightings: Sightings
 
     def scaled(self, scales: Array) -> "_Problem":
-        """With the variances of the three parts times `scales` (3,)."""
-        return _Problem(
-            self.steps._replace(information=self.steps.information / scales[0]),
-            self.closures._replace(information=self.closures.information / scales[1]),
-            self.sightings._replace(information=self.sightings.information / scales[2]),
+        """With the variances of steps and closures times `scales` (2,)."""
+        return self._replace(
+            steps=self.steps._replace(information=self.steps.information / scales[0]),
+            closures=self.closures._replace(information=self.closures.information / scales[1]),
         )
 
     def terms(self, poses: Array, lines: Array) -> list[Term]:
@@ -90,63 +89,78 @@ def smooth(
     flip = lines.sides > 0  # back to n pointing away from the robot
     parameters = np.where(flip[:, None], lines.parameters * [1, -1] + [np.pi, 0], lines.parameters)
     extents = np.where(flip[:, None], -lines.extents[:, ::-1], lines.extents)
-    spread, scales = POSE_SPREAD, np.ones(3)
-    factors: SuperLU | None = None
+    spread, scales = POSE_SPREAD, np.ones(2)
     for iterations in ITERATIONS:
         sightings = match_all(poses, parameters, extents, segments, params.gate, params.overlap_margin, spread)
-        taken = weighed(poses, parameters, sightings, segments, floors, factors)
-        problem = _Problem(*every, taken)
         for _ in range(iterations):
-            information, side = _normal_equations(poses, parameters, problem.scaled(scales))
-            factors = None  # each takes tens of megabytes: the old ones go before the new ones come
-            factors = posegraph.factorise(information)
-            poses, parameters, largest = _stepped(poses, parameters, factors.solve(side))
-            scales = scales * _variance_components(problem.scaled(scales), poses, parameters, factors)
-            scales = np.maximum(scales, [LEAST_STEP_SCALE, 0.0, 0.0])
+            problem = _Problem(*every, sightings).scaled(scales)
+            poses, parameters, factors, largest = _step(poses, parameters, problem)
+            scales = scales * _variance_components(problem, poses, parameters, factors)
+            scales = np.maximum(scales, [LEAST_STEP_SCALE, 0.0])
+            sightings = weighed(poses, parameters, sightings, segments, floors, factors)
+            del factors  # each takes tens of megabytes: the old ones go before the new ones come
             if largest < CONVERGED:
                 break
         extents, _ = extents_and_hits(poses, parameters, sightings, segments)
         spread = (POSE_SPREAD[0] / 2, POSE_SPREAD[1] / 2)
-    taken = weighed(poses, parameters, sightings, segments, floors, factors)
-    poses, parameters, information, scales = _honest(poses, parameters, _Problem(*distinct, taken))
-    extents, hits = extents_and_hits(poses, parameters, taken, segments)
+    sightings = with_rivals(poses, parameters, extents, sightings, segments, params.gate, params.overlap_margin)
+    poses, parameters, information, scales = _honest(
+        poses, parameters, _Problem(*distinct, sightings), segments, floors
+    )
+    extents, hits = extents_and_hits(poses, parameters, sightings, segments)
     return Smoothed(poses, parameters, extents, hits, information, scales)
 
 
-def _honest(poses: Array, lines: Array, problem: _Problem) -> tuple[Array, Array, sparse.csc_matrix, Array]:
-    """Poses and lines by what counts no noise twice, their information, and the variances' scales (3,).
+def _honest(
+    poses: Array, lines: Array, problem: _Problem, segments: Segments, floors: Array
+) -> tuple[Array, Array, sparse.csc_matrix, Array]:
+    """Poses and lines by what counts no noise twice, their information, and the variances' scales (2,).
 
     The information tells how far off the poses are that agree best with the same evidence. Those that more evidence
     found, which errs together, may be farther off: steps along a corridor, all a little long, drew out its doors.
     """
-    scales = np.ones(3)
+    scales = np.ones(2)
     for _ in range(HONEST_ITERATIONS):
-        information, side = _normal_equations(poses, lines, problem.scaled(scales))
-        factors = posegraph.factorise(information)
-        poses, lines, largest = _stepped(poses, lines, factors.solve(side))
-        change = _variance_components(problem.scaled(scales), poses, lines, factors)
-        before, scales = scales, scales * change
+        scaled = problem.scaled(scales)
+        poses, lines, factors, largest = _step(poses, lines, scaled)
+        before, scales = scales, scales * _variance_components(scaled, poses, lines, factors)
         # What odometry is off by in a few steps says little of its drift, which is systematic; and that neighbouring
-        # matches, which share most of their points, agree does not make them better. Lines have been weighed.
-        scales = np.maximum(scales, [LEAST_ODOMETRY_SCALE, 1.0, 1.0])
+        # matches, which share most of their points, agree does not make them better.
+        scales = np.maximum(scales, [LEAST_ODOMETRY_SCALE, 1.0])
+        problem = problem._replace(sightings=weighed(poses, lines, problem.sightings, segments, floors, factors))
+        del factors
         if largest < CONVERGED and np.abs(np.log(scales / before)).max() < SETTLED:
             break
-    return poses, lines, _normal_equations(poses, lines, problem.scaled(scales))[0], scales
+    return poses, lines, _normal_matrix(problem.scaled(scales).terms(poses, lines), poses, lines, problem, True), scales
 
 
-def _normal_equations(poses: Array, lines: Array, problem: _Problem) -> tuple[sparse.csc_matrix, Array]:
-    """Matrix and right-hand side of all unknowns but the first pose, which is held."""
+def _step(poses: Array, lines: Array, problem: _Problem) -> tuple[Array, Array, SuperLU, float]:
+    """Poses and lines after a step of Gauss-Newton, the factors that it took, and the poses' largest change."""
+    terms = problem.terms(poses, lines)
+    side = np.zeros(3 * len(poses) + 2 * len(lines))
+    for term in terms:
+        posegraph.add_side(side, term)
+    factors = posegraph.factorise(_normal_matrix(terms, poses, lines, problem))
+    poses, lines, largest = _stepped(poses, lines, factors.solve(side[3:]))
+    return poses, lines, factors, largest
+
+
+def _normal_matrix(
+    terms: list[Term], poses: Array, lines: Array, problem: _Problem, gained: bool = False
+) -> sparse.csc_matrix:
+    """Normal matrix of all unknowns but the first pose, which is held.
+
+    gained : with what the poses' information gains on the mean robust weight.
+    """
     n, m = len(poses), len(lines)
     size = 3 * n + 2 * m
     # A line that no segment is matched to any more stays where it is.
     unseen = np.setdiff1d(np.arange(m), problem.sightings.line)
     held = 3 * n + (2 * unseen[:, None] + np.arange(2)).ravel()
     matrix = sparse.csc_matrix((np.ones(len(held)), (held, held)), shape=(size, size))
-    side = np.zeros(size)
-    for term in problem.terms(poses, lines):
-        matrix = matrix + posegraph.term_matrix(term, size)
-        posegraph.add_side(side, term)
-    return sparse.csc_matrix(matrix[3:, 3:]), side[3:]
+    for term in terms:
+        matrix = matrix + posegraph.term_matrix(term, size) * (term.gain if gained else 1.0)
+    return sparse.csc_matrix(matrix[3:, 3:])
 
 
 def _stepped(poses: Array, lines: Array, step: Array) -> tuple[Array, Array, float]:
@@ -159,7 +173,7 @@ def _stepped(poses: Array, lines: Array, step: Array) -> tuple[Array, Array, flo
 
 
 def _variance_components(problem: _Problem, poses: Array, lines: Array, factors: SuperLU) -> Array:
-    """(3,) by how much the variances of the parts are too small (Foerstner 1979): residuals over redundancy.
+    """(2,) by how much the variances of steps and closures are too small (Foerstner 1979): residuals over redundancy.
 
     The redundancy of a part is its number of observations less the trace of N^-1 N_part, which random vectors of signs
     estimate (Hutchinson 1990); the seed is fixed, so that the same data give the same scales.
@@ -167,10 +181,11 @@ def _variance_components(problem: _Problem, poses: Array, lines: Array, factors:
     size = 3 * len(poses) + 2 * len(lines)
     probes = np.random.default_rng(0).choice([-1.0, 1.0], size=(size - 3, PROBES))
     solved = factors.solve(probes)
-    scales = np.ones(3)
-    for k, term in enumerate(problem.terms(poses, lines)):
-        part = posegraph.term_matrix(term, size)[3:, 3:]
-        redundancy = term.observations - float(np.einsum("ik,ik->", solved, part @ probes)) / PROBES
+    scales = np.ones(2)
+    for k, part in enumerate((problem.steps, problem.closures)):
+        term = posegraph.edge_term(poses, part)
+        matrix = posegraph.term_matrix(term, size)[3:, 3:]
+        redundancy = term.observations - float(np.einsum("ik,ik->", solved, matrix @ probes)) / PROBES
         # Without much left over, a part tells nothing of its own errors.
         if redundancy > max(10.0, 0.05 * term.observations):
             scales[k] = np.clip(term.distance / (term.share * redundancy), LEAST_SCALE, MOST_SCALE)

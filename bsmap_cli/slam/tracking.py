@@ -223,7 +223,7 @@ def _points_of_scans(log: ScanLog, range_sigma: float) -> Iterator[OrientedPoint
     """Oriented points of each horizontal scan in turn, at most MOST_POINTS of each."""
     scans = log.horizontal
     laser = se2.from_matrix(scans.mount)[:2]
-    for some, points in scan_batches(scans, np.arange(len(scans.time_ns)), beam_motion(log)):
+    for some, points in scan_batches(scans, np.arange(len(scans.time_ns)), beam_motion(scans, log.odometry)):
         oriented, index = oriented_points(points, laser, range_sigma)
         border = np.searchsorted(points.scan[index], np.arange(some.start, some.stop + 1))
         for a, b in pairwise(border.tolist()):

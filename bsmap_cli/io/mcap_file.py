@@ -117,10 +117,14 @@ class RosWriter:
 
     def write(self, topic: str, message: Any, log_time: int) -> None:
         """Append a message of rosbags' type store."""
+        self.write_encoded(topic, message.__msgtype__, ros.encode(message), log_time)
+
+    def write_encoded(self, topic: str, type_name: str, data: bytes, log_time: int) -> None:
+        """Append a message of a type, given as its CDR."""
         channel = self._channels.get(topic)
         if channel is None:
-            channel = self._channels[topic] = self._register(topic, message.__msgtype__)
-        self.mcap.add_message(channel, log_time, ros.encode(message), log_time)
+            channel = self._channels[topic] = self._register(topic, type_name)
+        self.mcap.add_message(channel, log_time, data, log_time)
 
     def _register(self, topic: str, type_name: str) -> int:
         if type_name not in self._schemas:

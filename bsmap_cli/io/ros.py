@@ -3,7 +3,7 @@
 Types and their definitions come from rosbags' type store (ROS 2 Humble), (de)serialised as CDR.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from rosbags.typesys import Stores, get_typestore
 
-from bsmap_cli.model import Array, LaserScans
+from bsmap_cli.model import Array, IntArray, LaserScans
 
 LASER_SCAN = "sensor_msgs/msg/LaserScan"
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -23,6 +23,7 @@ STRING = "std_msgs/msg/String"
 NUMBERS = "std_msgs/msg/Float64MultiArray"
 
 NANOSECONDS = 1_000_000_000
+_STAMP_MARK = 1_234_567_890_123_456_789
 # Rows and columns of x, y, theta in the 6 x 6 covariance of a ROS pose (x, y, z, roll, pitch, yaw).
 PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
 
@@ -42,6 +43,31 @@ def schema_text(type_name: str) -> bytes:
 def encode(message: Any) -> bytes:
     """CDR of a message of the type store."""
     return bytes(typestore().serialize_cdr(message, message.__msgtype__))
+
+
+def encode_alike(message_of: Callable[[int, Array], Any], time_ns: IntArray, numbers: Array) -> list[bytes]:
+    """CDR of messages that differ by stamp and numbers alone: `encode(message_of(t, row))` of each, made at once.
+
+    CDR lays out messages alike whose strings and arrays are equally long. So one is encoded with marks in the places of
+    its stamp and numbers, and the others are copies of it with those of their own.
+
+    message_of : message of a stamp in ns and numbers (k,), each of which goes as it is into one field of 64 bits.
+    time_ns : (n,).  numbers : (n, k).
+    """
+    seconds, nanoseconds = np.divmod(np.asarray(time_ns, np.int64), NANOSECONDS)
+    stamps = np.stack([seconds, nanoseconds], axis=1).astype("<u4").view(np.uint8)
+    values = np.ascontiguousarray(numbers, "<f8").view(np.uint8)
+    marks = np.pi + np.arange(numbers.shape[1], dtype=np.float64)
+    example = encode(message_of(_STAMP_MARK, marks))
+    fields = [(np.array(divmod(_STAMP_MARK, NANOSECONDS), "<u4").tobytes(), stamps)]
+    fields += [(mark.tobytes(), values[:, 8 * k : 8 * k + 8]) for k, mark in enumerate(marks)]
+    copies = np.tile(np.frombuffer(example, np.uint8), (len(stamps), 1))
+    for mark, field in fields:
+        if example.count(mark) > 1:
+            raise ValueError("a stamp or number stands in the message more than once")
+        if (at := example.find(mark)) >= 0:
+            copies[:, at : at + 8] = field
+    return [copy.tobytes() for copy in copies]
 
 
 def decode(data: bytes, type_name: str) -> Any:
@@ -101,14 +127,24 @@ def matrix_from_quaternion(q: ArrayLike) -> Array:
 
 def transform_message(matrix: Array, time_ns: int, parent: str, child: str) -> Any:
     """geometry_msgs/TransformStamped that maps `child` coordinates to `parent`; matrix (4, 4)."""
-    x, y, z, w = quaternion_from_matrix(matrix[:3, :3]).tolist()
+    return _transform(matrix[:3, 3], quaternion_from_matrix(matrix[:3, :3]), time_ns, parent, child)
+
+
+def planar_transform(numbers: Array, time_ns: int, parent: str, child: str) -> Any:
+    """geometry_msgs/TransformStamped of `pose_numbers` (4,)."""
+    x, y, qz, qw = numbers
+    return _transform(np.array([x, y, 0.0]), np.array([0.0, 0.0, qz, qw]), time_ns, parent, child)
+
+
+def _transform(place: Array, quaternion: Array, time_ns: int, parent: str, child: str) -> Any:
+    x, y, z, w = quaternion.tolist()
     return make(
         "geometry_msgs/msg/TransformStamped",
         header=header(time_ns, parent),
         child_frame_id=child,
         transform=make(
             "geometry_msgs/msg/Transform",
-            translation=make("geometry_msgs/msg/Vector3", **dict(zip("xyz", matrix[:3, 3].tolist(), strict=True))),
+            translation=make("geometry_msgs/msg/Vector3", **dict(zip("xyz", place.tolist(), strict=True))),
             rotation=make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
         ),
     )
@@ -130,14 +166,43 @@ def matrix_of(transform: Any) -> Array:
 
 def pose_message(pose: ArrayLike) -> Any:
     """geometry_msgs/Pose of a planar pose x, y, theta."""
-    x, y, theta = np.asarray(pose, dtype=float).tolist()
+    return pose_of_numbers(pose_numbers(np.asarray(pose, dtype=float)))
+
+
+def pose_numbers(poses: Array) -> Array:
+    """(..., 4) numbers of a pose message that are not 0: x, y, z and w of the quaternion of poses (..., 3)."""
+    half = poses[..., 2] / 2
+    return np.stack([poses[..., 0], poses[..., 1], np.sin(half), np.cos(half)], axis=-1)
+
+
+def pose_of_numbers(numbers: Array) -> Any:
+    """geometry_msgs/Pose of `pose_numbers` (4,)."""
+    x, y, qz, qw = numbers.tolist()
     return make(
         "geometry_msgs/msg/Pose",
         position=make("geometry_msgs/msg/Point", x=x, y=y, z=0.0),
-        orientation=make(
-            "geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=float(np.sin(theta / 2)), w=float(np.cos(theta / 2))
-        ),
+        orientation=make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=qz, w=qw),
     )
+
+
+def encode_path(time_ns: IntArray, poses: Array, start: int) -> bytes:
+    """CDR of a nav_msgs/Path in map of poses (n, 3) with stamps (n,), itself stamped `start`, both ns."""
+
+    def stamped(t: int, numbers: Array) -> Any:
+        return make("geometry_msgs/msg/PoseStamped", header=header(t, "map"), pose=pose_of_numbers(numbers))
+
+    def path(some: list[Any]) -> bytes:
+        return encode(make(PATH, header=header(start, "map"), poses=some))
+
+    numbers = pose_numbers(poses)
+    if len(poses) == 0:
+        return path([])
+    # The number of poses stands last in a path without any. The first pose ends at a multiple of 8 bytes, from which
+    # on the others stand as they do alone, less the 4 bytes that tell the encoding.
+    count, first = len(path([])) - 4, path([stamped(int(time_ns[0]), numbers[0])])
+    others = encode_alike(stamped, time_ns[1:], numbers[1:])
+    head = first[:count] + np.array(len(poses), "<u4").tobytes() + first[count + 4 :]
+    return b"".join([head, *(other[4:] for other in others)])
 
 
 def planar_pose(pose: Any) -> tuple[float, float, float]:
@@ -147,12 +212,12 @@ def planar_pose(pose: Any) -> tuple[float, float, float]:
     return pose.position.x, pose.position.y, float(yaw)
 
 
-def pose_with_covariance(pose: ArrayLike, covariance: Array | None = None) -> Any:
-    """geometry_msgs/PoseWithCovariance of x, y, theta and its covariance (3, 3); zeros (unknown) without."""
+def pose_with_covariance(pose: Any, covariance: Array | None = None) -> Any:
+    """geometry_msgs/PoseWithCovariance of a Pose and the covariance (3, 3) of x, y, theta; zeros (unknown) without."""
     full = np.zeros((6, 6))
     if covariance is not None:
         full[PLANAR] = covariance
-    return make("geometry_msgs/msg/PoseWithCovariance", pose=pose_message(pose), covariance=full.ravel())
+    return make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=full.ravel())
 
 
 def odometry_message(time_ns: int, pose: ArrayLike, frame_id: str = "odom", child_frame_id: str = "base_link") -> Any:
@@ -163,7 +228,7 @@ def odometry_message(time_ns: int, pose: ArrayLike, frame_id: str = "odom", chil
         ODOMETRY,
         header=header(time_ns, frame_id),
         child_frame_id=child_frame_id,
-        pose=pose_with_covariance(pose),
+        pose=pose_with_covariance(pose_message(pose)),
         twist=make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
     )
 

@@ -58,6 +58,15 @@ def test_information_is_that_of_the_scatter(target, points):
     assert 0.9 * low < sum(distances) < high
 
 
+def test_where_only_the_prior_pulls_the_match_is_its_normal_equations(target, points):
+    """One step from a start that the points agree with, against numpy: prior and points weighed by information."""
+    prior = np.array([[4e4, 1e3, -2e3], [1e3, 3e4, 5e2], [-2e3, 5e2, 6e4]])
+    pose = np.array([0.004, -0.003, 0.001])
+    found = match(seen_at(pose, points, sigma=0.0), target, np.zeros(3), prior, SIGMA, reach=0.15)
+    between = np.linalg.solve(found.information + prior, found.information @ pose)
+    np.testing.assert_allclose(found.pose, between, atol=2e-5)
+
+
 def test_bare_corridor_keeps_the_prior_along_it():
     walls = np.array([[[-8, -1], [8, -1]], [[-8, 1], [8, 1]]], float)
     inside = wall_points(walls / [2.0, 1.0], ORIGIN, spacing=0.07)
@@ -104,6 +113,21 @@ def test_search_finds_a_start_that_is_too_far_for_the_match(target, points):
     found = max((match(seen, target, start, LOOSE, SIGMA) for start in starts), key=lambda m: m.inliers)
     np.testing.assert_allclose(found.pose, pose, atol=0.005)
     assert found.inliers > 0.95
+
+
+def test_search_begins_where_the_points_themselves_would_choose_to(target, points):
+    """Slow twin: every point of every start asks for its own nearest one, not for that of a cell."""
+    seen = seen_at(np.array([0.7, -0.5, 0.2]), points)
+    thin = OrientedPoints(*(part[:: len(points.xy) // 70] for part in seen))
+    steps, angles = 0.3 * np.arange(-3, 4), 0.12 * np.arange(-3, 4)
+    score = {}
+    for start in np.array(np.meshgrid(steps, steps, angles)).reshape(3, -1).T:
+        placed = thin.moved(start)
+        away, nearest = target.tree.query(placed.xy)
+        facing = np.einsum("ij,ij->i", target.points.normal[nearest], placed.normal) > 0.7
+        score[tuple(np.round(start, 6))] = float(np.mean(np.exp(-0.5 * (away / 0.24) ** 2) * facing * (away < 0.72)))
+    found = search(seen, target, np.zeros(3), 1.0, 0.4)[0]
+    assert score[tuple(np.round(found, 6))] > 0.95 * max(score.values())
 
 
 def test_search_prefers_the_nearest_of_equal_places():

@@ -7,7 +7,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg.lapack import dposv
 from scipy.spatial import cKDTree
 
 from bsmap_cli.core import se2
@@ -19,12 +18,17 @@ NORMAL_REACH = 0.12
 
 
 SEARCH_POINTS = 70
-SEARCH_STEP, SEARCH_STEPS, SEARCH_ANGLE = 0.3, 8, 0.12
-"""Points looked at; steps of the grid of starts in metres and radians, wider where too many would be needed."""
+SEARCH_STEP, SEARCH_STEPS, SEARCH_ANGLE, SEARCH_CELLS = 0.3, 8, 0.12, 6
+"""Points looked at; steps of the grid of starts in metres and radians, wider where too many would be needed; cells of
+a step within which all points have the same nearest one."""
 LEAST_REACH = 0.15
 """Metres within which points pair in the end."""
 SAME_WAY = 0.7
 """Cosine of the angle between normals above which two points can be of one surface."""
+
+
+Floats = tuple[float, float, float]
+"""A pose x, y, theta where numpy costs more than it does."""
 
 
 class OrientedPoints(NamedTuple):
@@ -111,21 +115,18 @@ def oriented_points(points: ScanPoints, laser_xy: Array, range_sigma: float) -> 
 class _Pairs(NamedTuple):
     """Points paired from one pose, the closer ones within `reach` metres.
 
-    xy : (2, k) of the source, in its frame.  normal : (2, k), offset : (k,), of the lines of the target.
-    distance : (k,) metres between the two.
+    terms : (k, 5) of each pair's error, see `_moments`.  distance : (k,) metres between the two.
     """
 
-    pose: Array
+    pose: Floats
     reach: float
-    xy: Array
-    normal: Array
-    offset: Array
+    terms: Array
     distance: Array
 
     def within(self, reach: float) -> "_Pairs":
         """The pairs that are closer than `reach`."""
-        near = self.distance < reach
-        return _Pairs(self.pose, reach, self.xy[:, near], self.normal[:, near], self.offset[near], self.distance[near])
+        near = np.flatnonzero(self.distance < reach)
+        return _Pairs(self.pose, reach, self.terms[near], self.distance[near])
 
 
 def match(
@@ -142,7 +143,8 @@ def match(
     prior : (3, 3) information of the initial pose, in the target's frame; what the points do not tell stays there.
     reach : metres within which points can pair at first.
     """
-    pose = initial.copy()
+    start: Floats = tuple(initial.tolist())
+    pose, known = start, prior.tolist()
     floor = max(2 * range_sigma, 0.05)
     pairs = None
     for _ in range(iterations):
@@ -150,57 +152,74 @@ def match(
             pairs = _pair(source, target, pose, reach)
         elif reach < pairs.reach:
             pairs = pairs.within(reach)
-        if len(pairs.offset) < 5:
+        if len(pairs.distance) < 5:
             return Match(initial, np.zeros((3, 3)), 0.0, 0.0)
-        moments, e = _moments(pairs, pose, max(floor, reach / 4))
-        information = moments[:3, :3] / range_sigma**2
-        away = pose - initial
-        away[2] = se2.wrap(away[2])
-        step = dposv(information + prior, -moments[:3, 3] / range_sigma**2 - prior @ away)[1]
-        pose += step
-        x, y, theta = step.tolist()
+        moments, e = _moments(pairs, pose, max(floor, reach / 4), range_sigma)
+        x, y, theta = _step(moments.tolist(), known, (pose[0] - start[0], pose[1] - start[1], pose[2] - start[2]))
+        pose = (pose[0] + x, pose[1] + y, pose[2] + theta)
         if reach <= LEAST_REACH and abs(x) + abs(y) < 1e-3 and abs(theta) < 5e-4:
             break
         reach = max(LEAST_REACH, reach * 0.5)
-    on = np.abs(e) < floor
-    pose[2] = se2.wrap(pose[2])
-    rms = float(np.sqrt(np.mean(e[on] ** 2))) if on.any() else 0.0
-    return Match(pose, information, np.count_nonzero(on) / max(len(source.xy), 1), rms)
+    on = e[np.abs(e) < floor]
+    rms = math.sqrt(float(on @ on) / len(on)) if len(on) else 0.0
+    wrapped = np.array([pose[0], pose[1], math.remainder(pose[2], math.tau)])
+    return Match(wrapped, moments[:3, :3], len(on) / max(len(source.xy), 1), rms)
 
 
-def _moments(pairs: _Pairs, pose: Array, width: float) -> tuple[Array, Array]:
+def _moments(pairs: _Pairs, pose: Floats, width: float, sigma: float) -> tuple[Array, Array]:
     """(4, 4) weighted sums of products of the derivatives by x, y, theta and of the errors; the errors (k,), metres.
 
-    Weights of the Cauchy loss, `width` metres wide.
+    A point p of the source errs from the line with normal n and offset r by n . (R p + t) - r, which is linear in the
+    five terms n, n . p, n x p and r with factors that the pose alone gives. Weights of the Cauchy loss, `width` metres
+    wide, over sigma squared.
     """
-    (nx, ny), turned = pairs.normal, _turn(pose[2]) @ pairs.xy
-    A = np.empty((4, len(pairs.offset)))
-    A[:2] = pairs.normal
-    np.subtract(ny * turned[0], nx * turned[1], out=A[2])
-    A[3] = nx * (turned[0] + pose[0]) + ny * (turned[1] + pose[1]) - pairs.offset
-    return (A / (1.0 + (A[3] / width) ** 2)) @ A.T, A[3]
-
-
-def _turn(theta: float) -> Array:
-    """(2, 2) rotation by theta."""
+    x, y, theta = pose
     c, s = math.cos(theta), math.sin(theta)
-    return np.array([[c, -s], [s, c]])
+    factors = np.array([[1.0, 0, 0, 0, 0], [0, 1.0, 0, 0, 0], [0, 0, -s, -c, 0], [x, y, c, -s, -1.0]])
+    A = factors @ pairs.terms.T
+    spread = A[3] * (sigma / width)
+    spread *= spread
+    spread += sigma**2
+    return (A / spread) @ A.T, A[3]
 
 
-def _has_moved(before: Array, pose: Array) -> bool:
+def _step(moments: list[list[float]], prior: list[list[float]], away: Floats) -> Floats:
+    """Step of Gauss-Newton from the moments (4, 4) and from the prior (3, 3) of the pose that is `away`.
+
+    By LDL' on plain numbers, for numpy's calls take several times as long for so few.
+    """
+    (a, b, c, u), (_, d, e, v), (_, _, f, w), _ = moments
+    x, y, theta = away[0], away[1], math.remainder(away[2], math.tau)
+    (pa, pb, pc), (_, pd, pe), (_, _, pf) = prior
+    u, v, w = -u - pa * x - pb * y - pc * theta, -v - pb * x - pd * y - pe * theta, -w - pc * x - pe * y - pf * theta
+    a, b, c, d, e, f = a + pa, b + pb, c + pc, d + pd, e + pe, f + pf
+    ba, ca = b / a, c / a
+    d, e, f = d - ba * b, e - ba * c, f - ca * c
+    v, w = v - ba * u, w - ca * u
+    ed = e / d
+    theta = (w - ed * v) / (f - ed * e)
+    y = v / d - ed * theta
+    return u / a - ba * y - ca * theta, y, theta
+
+
+def _has_moved(before: Floats, pose: Floats) -> bool:
     """Whether points may have other partners now than where they were paired."""
-    x, y, theta = (pose - before).tolist()
-    return abs(x) + abs(y) > 0.02 or abs(theta) > 0.006
+    return abs(pose[0] - before[0]) + abs(pose[1] - before[1]) > 0.02 or abs(pose[2] - before[2]) > 0.006
 
 
-def _pair(source: OrientedPoints, target: Target, pose: Array, reach: float) -> _Pairs:
-    """Each point of the source, at `pose` (3,), with the nearest of the target that faces its way."""
-    R = _turn(pose[2]).T
+def _pair(source: OrientedPoints, target: Target, pose: Floats, reach: float) -> _Pairs:
+    """Each point of the source, at the pose, with the nearest of the target that faces its way."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    R = np.array([[c, s], [-s, c]])
     distance, nearest = nearest_points(target, source.xy @ R + pose[:2], reach)
     lines, facing = target.lines[nearest], source.normal @ R
     same = np.flatnonzero(lines[:, 0] * facing[:, 0] + lines[:, 1] * facing[:, 1] > SAME_WAY)
-    lines = lines[same].T
-    return _Pairs(pose.copy(), reach, source.xy[same].T, lines[:2], lines[2], distance[same])
+    lines, xy = lines[same], source.xy[same]
+    terms = np.empty((len(same), 5))
+    terms[:, :2], terms[:, 4] = lines[:, :2], lines[:, 2]
+    nx, ny, x, y = lines[:, 0], lines[:, 1], xy[:, 0], xy[:, 1]
+    terms[:, 2], terms[:, 3] = nx * x + ny * y, nx * y - ny * x
+    return _Pairs(pose, reach, terms, distance[same])
 
 
 def search(
@@ -215,19 +234,38 @@ def search(
     thin = slice(None, None, max(1, len(source.xy) // SEARCH_POINTS))
     points = OrientedPoints(source.xy[thin], source.normal[thin])
     step = max(SEARCH_STEP, span / SEARCH_STEPS)
-    sigma = 0.8 * step
     angles = initial[2] + _centred(turn, SEARCH_ANGLE)
     shifts = np.stack(np.meshgrid(_centred(span, step), _centred(span, step)), axis=-1).reshape(-1, 2)
     turned = points.moved(np.stack([0 * angles, 0 * angles, angles], axis=-1)[:, None])
-    places = turned.xy[:, None] + initial[:2] + shifts[None, :, None]
-    normals = np.broadcast_to(turned.normal[:, None], places.shape).reshape(-1, 2)
-    distance, nearest = nearest_points(target, places.reshape(-1, 2), 3 * sigma)
-    near = np.flatnonzero(np.isfinite(distance))
-    near = near[np.einsum("ij,ij->i", target.points.normal[nearest[near]], normals[near]) > SAME_WAY]
-    score = np.zeros(len(distance))
-    score[near] = np.exp(-0.5 * (distance[near] / sigma) ** 2)
-    order = np.argsort(-score.reshape(len(angles) * len(shifts), -1).mean(axis=1), kind="stable")[:best]
+    score = _scores(target, turned.xy + initial[:2], turned.normal, np.rint(shifts / step).astype(int), step)
+    order = np.argsort(-score.ravel(), kind="stable")[:best]
     return [np.array([*(initial[:2] + shifts[k % len(shifts)]), angles[k // len(shifts)]]) for k in order]
+
+
+def _scores(target: Target, xy: Array, normal: Array, shifts: IntArray, step: float) -> Array:
+    """(a, s) how well points (a, p, 2) with normals lie on the target when shifted by `shifts` (s, 2) steps.
+
+    Points in one cell of a grid, SEARCH_CELLS a step, have one nearest point of the target, that of the cell's centre:
+    many starts share a cell, and the target is asked for each one only once.
+    """
+    cell, sigma = step / SEARCH_CELLS, 0.8 * step
+    at, moved = np.rint(xy / cell).astype(int), SEARCH_CELLS * shifts
+    low = at.min(axis=(0, 1)) + moved.min(axis=0)
+    width, height = at.max(axis=(0, 1)) + moved.max(axis=0) - low + 1
+    strides = np.array([height, 1])
+    index = ((at - low) @ strides)[:, None] + (moved @ strides)[:, None]
+    seen = np.zeros(width * height, bool)
+    seen[index] = True
+    cells = np.flatnonzero(seen)
+    number = np.empty(width * height, np.int32)  # of each cell that was seen
+    number[cells] = np.arange(len(cells))
+    centres = cell * (np.stack(np.divmod(cells, height), axis=1) + low)
+    distance, nearest = nearest_points(target, centres, 3 * sigma)
+    score = np.exp(-0.5 * (distance / sigma) ** 2)
+    which = number[index]
+    nx, ny = target.lines[nearest, 0][which], target.lines[nearest, 1][which]
+    facing = nx * normal[:, None, :, 0] + ny * normal[:, None, :, 1] > SAME_WAY
+    return np.asarray((score[which] * facing).mean(axis=-1))
 
 
 def _centred(reach: float, step: float) -> Array:

@@ -86,30 +86,40 @@ def oriented_points(points: ScanPoints, laser_xy: Array, range_sigma: float) -> 
     The normal is that of the best line through neighbouring points of one surface, by running sums of moments.
     """
     n = len(points.scan)
-    near = np.hypot(*np.diff(points.xy, axis=0).T)
-    step = np.median(np.diff(points.angle)[np.diff(points.beam) == 1]) if n > 1 else 0.0
-    jump = (near > 0.15 + 6 * np.abs(step) * points.range[:-1]) | (np.diff(points.scan) != 0)
-    group = np.r_[0, np.cumsum(jump)]
-    first = np.searchsorted(group, group, "left")
-    last = np.searchsorted(group, group, "right")
-    half = np.clip(np.rint(NORMAL_REACH / np.maximum(points.range * abs(step), 1e-4)), 2, 12).astype(int)
+    if n == 0:
+        return OrientedPoints(points.xy, points.direction), np.zeros(0, int)
+    x, y = np.ascontiguousarray(points.xy.T)
+    step = abs(float(np.median(np.diff(points.angle)[np.diff(points.beam) == 1]))) if n > 1 else 0.0
+    apart = np.diff(x) ** 2 + np.diff(y) ** 2
+    jump = (apart > (0.15 + 6 * step * points.range[:-1]) ** 2) | (np.diff(points.scan) != 0)
+    border = np.concatenate([[0], np.flatnonzero(jump) + 1, [n]])
+    first, last = (np.repeat(border[k : len(border) - 1 + k], np.diff(border)) for k in (0, 1))
+    half = np.rint(NORMAL_REACH / np.maximum(points.range * step, 1e-4)).clip(2, 12).astype(int)
     index = np.arange(n)
     half = np.minimum(half, np.maximum(np.minimum(index - first, last - 1 - index), 1))
     low, high = np.maximum(index - half, first), np.minimum(index + half + 1, last)
-    x, y = points.xy[:, 0], points.xy[:, 1]
-    sums = np.zeros((n + 1, 5))
-    np.cumsum(np.stack([x, y, x * x, x * y, y * y], axis=1), axis=0, out=sums[1:])
-    count = high - low
-    m = (sums[high] - sums[low]) / np.maximum(count, 1)[:, None]
-    xx, xy, yy = m[:, 2] - m[:, 0] ** 2, m[:, 3] - m[:, 0] * m[:, 1], m[:, 4] - m[:, 1] ** 2
-    angle = 0.5 * np.arctan2(2 * xy, xx - yy)
-    normal = np.stack([-np.sin(angle), np.cos(angle)], axis=1)
-    spread = np.sqrt(((xx - yy) / 2) ** 2 + xy**2)
-    across, along = (xx + yy) / 2 - spread, (xx + yy) / 2 + spread
-    away = np.einsum("ij,ij->i", normal, points.xy - laser_xy) > 0
-    normal[away] *= -1
-    good = (count >= 3) & (across < 0.15 * along) & (across < (5 * range_sigma) ** 2)
-    return OrientedPoints(points.xy[good], normal[good]), np.flatnonzero(good)
+    sums = np.zeros((5, n + 1))
+    np.cumsum([x, y, x * x, x * y, y * y], axis=1, out=sums[:, 1:])
+    mx, my, xx, xy, yy = (np.take(sums, high, axis=1) - np.take(sums, low, axis=1)) / (high - low)
+    xx, xy, yy = xx - mx * mx, xy - mx * my, yy - my * my
+    middle, half_difference = (xx + yy) / 2, (xx - yy) / 2
+    spread = np.sqrt(half_difference**2 + xy**2)
+    across, along = middle - spread, middle + spread
+    good = np.flatnonzero((high - low >= 3) & (across < 0.15 * along) & (across < (5 * range_sigma) ** 2))
+    at, normal = points.xy[good], _normals(half_difference[good], xy[good], spread[good])
+    normal[np.einsum("ij,ij->i", normal, at - laser_xy) > 0] *= -1
+    return OrientedPoints(at, normal), good
+
+
+def _normals(half_difference: Array, xy: Array, spread: Array) -> Array:
+    """(n, 2) unit normals of the lines along which points scatter.
+
+    half_difference : (n,) of the moments xx and yy.  xy : (n,).  spread : (n,) root of both squared, not 0.
+    """
+    large = np.sqrt(0.5 + np.abs(half_difference) / (2 * spread))  # the larger one of the direction's cosine and sine
+    small, sign = np.abs(xy) / (2 * spread * large), np.where(xy < 0, -1.0, 1.0)
+    level = half_difference >= 0
+    return np.stack([-sign * np.where(level, small, large), np.where(level, large, small)], axis=1)
 
 
 class _Pairs(NamedTuple):

@@ -1,5 +1,6 @@
 """The filter's motion prior: odometry or constant velocity, with noise; the motion within one scan."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -31,11 +32,12 @@ def odometry_motion(before: Array, after: Array, params: SlamParams, scale: floa
 
     scale : metres of way for a metre of odometry.
     """
-    increment = se2.between(before, after) * [scale, scale, 1.0]
-    distance, angle = float(np.hypot(*increment[:2])), abs(float(increment[2]))
+    x, y, turn = se2.between(before, after).tolist()
+    distance, angle = scale * math.hypot(x, y), abs(turn)
     place = params.odometry_translation * distance + params.odometry_coupling * angle
     heading = params.odometry_rotation * angle + params.odometry_coupling * distance
-    return Motion(increment, np.diag([place, place, heading]) ** 2)
+    noise = np.array([[place**2, 0.0, 0.0], [0.0, place**2, 0.0], [0.0, 0.0, heading**2]])
+    return Motion(np.array([scale * x, scale * y, turn]), noise)
 
 
 class OdometryScale(NamedTuple):

@@ -65,16 +65,16 @@ def scan_points(
     ranges : (k, m), nan is no return.  angles : (m,).  mount : (3,), of the laser in base_link.
     beam_motion : (k, 3), of base_link from one beam to the next (x, y, theta), small.
     """
-    scan, beam = np.nonzero(np.isfinite(ranges))
-    r, angle = ranges[scan, beam].astype(float), angles[beam]
-    heading = mount[2] + angle
-    moved = beam_motion[scan] * beam[:, None]
-    c, s = np.cos(moved[:, 2]), np.sin(moved[:, 2])
-    bx, by = np.cos(heading), np.sin(heading)
-    x, y = mount[0] + r * bx, mount[1] + r * by
-    xy = np.stack([moved[:, 0] + c * x - s * y, moved[:, 1] + s * x + c * y], axis=1)
-    direction = np.stack([c * bx - s * by, s * bx + c * by], axis=1)
-    return ScanPoints(scan + first_scan, beam, xy, direction, r, angle)
+    valid = np.isfinite(ranges)
+    scan, beam = np.nonzero(valid)
+    r, heading = ranges[valid].astype(float), mount[2] + angles
+    direction = np.stack([np.cos(heading), np.sin(heading)], axis=1)[beam]
+    xy = mount[:2] + r[:, None] * direction
+    if beam_motion.any():
+        moved = beam_motion[scan] * beam[:, None]
+        turn = moved * [0.0, 0.0, 1.0]
+        xy, direction = se2.transform(moved, xy), se2.transform(turn, direction)
+    return ScanPoints(scan + first_scan, beam, xy, direction, r, angles[beam])
 
 
 def scan_batches(scans: LaserScans, chosen: IntArray, beam_motion: Array) -> Iterator[tuple[range, ScanPoints]]:

@@ -1,5 +1,6 @@
 """Tracking: every scan that moved is matched to the map of the last key scans, started from the motion prior."""
 
+import math
 from collections.abc import Iterator
 from itertools import pairwise
 from typing import NamedTuple
@@ -72,7 +73,7 @@ def track_scans(log: ScanLog, range_sigma: float, params: SlamParams, track: Tra
     """Poses of all scans by matching each to the local map."""
     n = len(log.horizontal.time_ns)
     poses = np.zeros((n, 3))
-    keys, key_points, information, by_match, inliers = [0], [], [], [], [1.0]
+    keys, key_points, priors, by_match, inliers = [0], [], [], [], [1.0]
     last, before, scale, matched = 0, 0, OdometryScale(), np.zeros(n, bool)
     noise = match_noise(range_sigma)
     scans = _points_of_scans(log, range_sigma)
@@ -94,16 +95,17 @@ def track_scans(log: ScanLog, range_sigma: float, params: SlamParams, track: Tra
             continue
         inliers.append(found.inliers)
         by_match.append(_in_frame_of(predicted, found.information))
-        information.append(_edge_information(by_match[-1], found, prior))
+        priors.append(prior.noise)
         if log.odometry is not None and min(inliers[-2:]) >= GOOD:
             scale = scale.seen(se2.between(log.odometry[keys[-1]], log.odometry[k]), step, by_match[-1])
         keys.append(k)
         key_points.append(points)
         placed = [*placed[-WINDOW:], points.moved(poses[k])]
         target = make_target(joined([placed[j - len(keys)] for j in _local(inliers)]))
-    chain = _chain(poses[keys], information, np.array(inliers))
-    match_information = np.array(by_match).reshape(-1, 3, 3)
     weak = np.array(inliers) < WEAK
+    match_information = np.array(by_match).reshape(-1, 3, 3)
+    information = _edge_information(match_information, np.array(priors).reshape(-1, 3, 3), weak[1:])
+    chain = _chain(poses[keys], information, np.array(inliers))
     adrift = _adrift(log, np.array(keys))
     return Tracking(poses, np.array(keys), key_points, chain, match_information, weak, adrift, scale.value, matched)
 
@@ -126,10 +128,12 @@ def _local(inliers: list[float]) -> list[int]:
 
     Of several in a row, as where the robot turns into a room that it has not seen, each helps to place the next.
     """
-    failed = np.concatenate([[False], np.array(inliers[-WINDOW - 1 :]) < WEAK, [False]])
-    alone = failed[1:-1] & ~failed[:-2] & ~failed[2:]
-    first = len(inliers) - len(alone)
-    return [first + int(j) for j in np.flatnonzero(~alone)][-WINDOW:]
+    failed = [False, *(share < WEAK for share in inliers[-WINDOW - 1 :]), False]
+    first = len(inliers) - (len(failed) - 2)
+    alone = [
+        now and not before and not after for before, now, after in zip(failed, failed[1:], failed[2:], strict=False)
+    ]
+    return [first + j for j, single in enumerate(alone) if not single][-WINDOW:]
 
 
 def match_noise(range_sigma: float) -> float:
@@ -138,7 +142,8 @@ def match_noise(range_sigma: float) -> float:
 
 
 def _moved(increment: Array, distance: float, angle: float) -> bool:
-    return bool(np.hypot(increment[0], increment[1]) >= distance or abs(increment[2]) >= angle)
+    x, y, turn = increment.tolist()
+    return math.hypot(x, y) >= distance or abs(turn) >= angle
 
 
 def _motion(log: ScanLog, poses: Array, before: int, last: int, k: int, params: SlamParams, scale: float) -> Motion:
@@ -152,49 +157,54 @@ def _motion(log: ScanLog, poses: Array, before: int, last: int, k: int, params: 
 
 def _match(points: OrientedPoints, target: Target, predicted: Array, prior: Motion, noise: float) -> Match:
     """Match from the prediction; where that is poor, from the best places of a wider search; else the prediction."""
-    spread = np.sqrt(np.diag(prior.noise)) + LEAST_SPREAD
-    information = np.diag(1.0 / spread**2)
-    reach = float(np.clip(0.2 + 4 * spread[0] + 2 * spread[2], 0.3, 1.0))
+    spread = np.sqrt(prior.noise.diagonal()) + LEAST_SPREAD
+    information = np.zeros((3, 3))
+    np.fill_diagonal(information, spread**-2)
+    place, _, heading = spread.tolist()
+    reach = min(max(0.2 + 4 * place + 2 * heading, 0.3), 1.0)
     best = match(points, target, predicted, information, noise, reach)
-    if best.inliers >= GOOD and _departure(best, predicted, information) < 9.0:
+    if best.inliers >= GOOD and _departure(best, predicted, spread) < 9.0:
         return best
-    span, turn = min(0.3 + 3 * spread[0], 1.5), min(0.12 + 3 * spread[2], 1.0)
+    span, turn = min(0.3 + 3 * place, 1.5), min(0.12 + 3 * heading, 1.0)
     loose = information / 100
     for start in search(points, target, predicted, span, turn):
         coarse = match(points, target, start, loose, noise, 0.5)
         fine = match(points, target, coarse.pose, loose, noise, 0.15)
-        if _worth(fine, predicted, information) > _worth(best, predicted, information):
+        if _worth(fine, predicted, spread) > _worth(best, predicted, spread):
             best = fine
-    credible = best.inliers >= (WEAK if _departure(best, predicted, information) < FAR else GOOD)
+    credible = best.inliers >= (WEAK if _departure(best, predicted, spread) < FAR else GOOD)
     return best if credible else Match(predicted, np.zeros((3, 3)), 0.0, 0.0)
 
 
-def _departure(found: Match, predicted: Array, information: Array) -> float:
-    away = found.pose - predicted
-    away[2] = se2.wrap(away[2])
-    return float(away @ information @ away)
+def _departure(found: Match, predicted: Array, spread: Array) -> float:
+    """Squared distance from the prediction, in standard deviations `spread` (3,)."""
+    (x, y, theta), (a, b, c) = (found.pose - predicted).tolist(), spread.tolist()
+    return (x / a) ** 2 + (y / b) ** 2 + (se2.wrap_one(theta) / c) ** 2
 
 
-def _worth(found: Match, predicted: Array, information: Array) -> float:
+def _worth(found: Match, predicted: Array, spread: Array) -> float:
     """Share of points on the map, less what leaving the prediction costs.
 
     A robot that turns where it has not been sees little that it knows: only a much better match may contradict the
     prediction, and then (a slipping wheel, lost scans) how far it does so no longer matters.
     """
-    return found.inliers - 0.02 * min(_departure(found, predicted, information), 15.0)
+    return found.inliers - 0.02 * min(_departure(found, predicted, spread), 15.0)
 
 
 def _in_frame_of(pose: Array, information: Array) -> Array:
     """Information (3, 3) of a pose in map, in the axes of the robot at `pose`."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
+    c, s = math.cos(pose[2]), math.sin(pose[2])
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return R.T @ information @ R
+    return np.asarray(R.T @ information @ R)
 
 
-def _edge_information(by_match: Array, found: Match, prior: Motion) -> Array:
-    """(3, 3) information of the step to a key scan, in the robot's axes; a failed match adds nothing to the prior."""
-    odometry = np.linalg.inv(prior.noise + np.diag(LEAST_SPREAD) ** 2)
-    return odometry / 4 if found.inliers < WEAK else limited(by_match + odometry, MATCH_FLOOR)
+def _edge_information(by_match: Array, noise: Array, failed: NDArray[np.bool_]) -> Array:
+    """(m, 3, 3) information of steps to key scans by matches and by priors with `noise` (m, 3, 3), in the robot's axes.
+
+    A failed match adds nothing to the prior.
+    """
+    odometry = np.linalg.inv(noise + np.diag(LEAST_SPREAD) ** 2)
+    return np.where(failed[:, None, None], odometry / 4, limited(by_match + odometry, MATCH_FLOOR))
 
 
 def limited(information: Array, floor: Array) -> Array:
@@ -203,7 +213,7 @@ def limited(information: Array, floor: Array) -> Array:
     return (both + np.swapaxes(both, -1, -2)) / 2
 
 
-def _chain(poses: Array, information: list[Array], inliers: Array) -> Edges:
+def _chain(poses: Array, information: Array, inliers: Array) -> Edges:
     """Edges between key scans: from the one before or, past a single failed one, from the one before that.
 
     For a match is one to the map of all. A failed one hangs on the last sound one: a single bad reading of the odometry
@@ -216,7 +226,7 @@ def _chain(poses: Array, information: list[Array], inliers: Array) -> Edges:
     sound = np.maximum.accumulate(np.where(failed, 0, np.arange(len(poses))))
     first = np.where(failed[second], sound[second - 1], second - 1 - alone)
     relative = se2.between(poses[first], poses[second])
-    return Edges(first, second, relative, np.array(information).reshape(-1, 3, 3), inliers[1:] < GOOD)
+    return Edges(first, second, relative, information, inliers[1:] < GOOD)
 
 
 def _points_of_scans(log: ScanLog, range_sigma: float) -> Iterator[OrientedPoints]:

@@ -10,6 +10,7 @@ from bsmap_cli.core.gaussian import (
     product,
     rounded_root,
     squared_distance,
+    squared_distance_2,
     symmetric_sqrt,
     unpack,
 )
@@ -138,3 +139,10 @@ def test_rounded_root_keeps_what_is_small_between_large_deviations():
 def test_nearly_singular_covariance_has_no_rounded_root():
     F = np.random.default_rng(1).normal(size=(6, 2)) * 1e-3
     assert rounded_root(F @ F.T, 1e-8, 200.0) is None
+
+
+def test_squared_distance_in_two_dimensions_is_that_in_any():
+    rng = np.random.default_rng(4)
+    half = rng.normal(size=(20, 2, 2))
+    covariance, difference = half @ half.swapaxes(1, 2), rng.normal(size=(20, 2))
+    np.testing.assert_allclose(squared_distance_2(difference, covariance), squared_distance(difference, covariance))

@@ -66,6 +66,13 @@ def squared_distance(difference: Array, covariance: Array) -> Array:
     return np.einsum("...k,...k->...", difference, solved)
 
 
+def squared_distance_2(difference: Array, covariance: Array) -> Array:
+    """The same for differences (..., 2), by Cramer's rule: for a few, a third of the time."""
+    x, y = difference[..., 0], difference[..., 1]
+    a, b, d = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
+    return (d * x * x - 2 * b * x * y + a * y * y) / (a * d - b * b)
+
+
 def product(a: Array, a_covariance: Array, b: Array, b_covariance: Array) -> tuple[Array, Array]:
     """Product of two Gaussian densities, Eq. (37-38): means (..., k), covariances (..., k, k)."""
     gain = np.swapaxes(np.linalg.solve(a_covariance + b_covariance, a_covariance), -1, -2)

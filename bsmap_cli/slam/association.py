@@ -1,5 +1,6 @@
 """Data association, method.md section 3: individual and joint compatibility, partial compatibility algorithm (PCA)."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -7,10 +8,10 @@ import numpy as np
 from scipy.linalg.lapack import dposv
 
 from bsmap_cli.core import se2
-from bsmap_cli.core.gaussian import chi2_gate
+from bsmap_cli.core.gaussian import chi2_gate, squared_distance_2
 from bsmap_cli.errors import BsmapError
 from bsmap_cli.model import Array, IntArray
-from bsmap_cli.slam.filter import FilterState, expected_lines, gather, line_jacobians
+from bsmap_cli.slam.filter import FilterState, add_blocks, expected_lines, gather, stacked_jacobian, state_index
 from bsmap_cli.slam.segments import Segments
 
 MAX_ANGLE = 0.5
@@ -32,6 +33,8 @@ class Candidates(NamedTuple):
 
     def joint_distance(self, pairs: Sequence[int]) -> float:
         """Squared Mahalanobis distance of the hypothesis that holds these pairs."""
+        if len(pairs) == 1:
+            return float(self.distance[pairs[0]])
         index = np.array([i for p in pairs for i in (2 * p, 2 * p + 1)])
         v = self.innovation[index]
         solved, failed = dposv(self.covariance[index[:, None], index], v)[1:]
@@ -42,8 +45,8 @@ class Candidates(NamedTuple):
     def of_segment(self) -> dict[int, list[int]]:
         """Pairs of each segment that has any, nearest first."""
         out: dict[int, list[int]] = {}
-        for pair, segment in enumerate(self.segment):
-            out.setdefault(int(segment), []).append(pair)
+        for pair, segment in enumerate(self.segment.tolist()):
+            out.setdefault(segment, []).append(pair)
         return out
 
 
@@ -59,21 +62,21 @@ def find_candidates(state: FilterState, extents: Array, segments: Segments, gate
         return empty
     segment, line = near
     innovation, covariance = _innovations(state, segments, segment, line)
-    blocks = covariance.reshape(len(line), 2, len(line), 2)[np.arange(len(line)), :, np.arange(len(line))]
-    distance = np.einsum("ki,ki->k", innovation, np.linalg.solve(blocks, innovation[..., None])[..., 0])
+    pair = np.arange(len(line))
+    blocks = covariance.reshape(len(line), 2, len(line), 2)[pair, :, pair]
+    distance = squared_distance_2(innovation, blocks)
     order = np.lexsort((distance, segment))
     order = order[distance[order] <= chi2_gate(gate, 2)]
-    index = np.stack([2 * order, 2 * order + 1], axis=1).ravel()
+    index = (2 * order[:, None] + np.arange(2)).ravel()
     return Candidates(
-        segment[order], line[order], innovation[order].ravel(), covariance[np.ix_(index, index)], distance[order]
+        segment[order], line[order], innovation[order].ravel(), covariance[index[:, None], index], distance[order]
     )
 
 
 def _near_pairs(state: FilterState, extents: Array, segments: Segments, margin: float) -> tuple[IntArray, IntArray]:
     """Pairs worth a test: similar direction, extents that overlap or nearly so, and not far apart in between."""
-    x, y, theta = state.pose
-    expected = expected_lines(state.pose, state.lines)
-    alpha = expected[:, 0] + theta
+    x, y, _ = state.pose.tolist()
+    expected, alpha = expected_lines(state.pose, state.lines), state.lines[:, 0]
     shift = -x * np.sin(alpha) + y * np.cos(alpha)
     low, high = extents[:, 0] - shift, extents[:, 1] - shift
     turn = se2.wrap(segments.parameters[:, None, 0] - expected[None, :, 0])
@@ -82,8 +85,8 @@ def _near_pairs(state: FilterState, extents: Array, segments: Segments, margin: 
     # Two lines that differ in direction are compared where they are seen, not at the foot of the normal.
     middle = (segments.extents[:, 0] + segments.extents[:, 1]) / 2
     apart = segments.parameters[:, None, 1] - expected[None, :, 1] - turn * middle[:, None]
-    sigma = np.sqrt(np.maximum(np.diag(gather(state.covariance, np.arange(3))), 0.0))
-    reach = 0.5 + 4.0 * (sigma[0] + sigma[1])
+    sigma = [math.sqrt(max(float(state.covariance[k, k]), 0.0)) for k in (0, 1)]
+    reach = 0.5 + 4.0 * sum(sigma)
     near = (np.abs(turn) < MAX_ANGLE) & (end - begin > -margin) & (np.abs(apart) < reach)
     segment, line = np.nonzero(near)
     return segment, line
@@ -91,21 +94,13 @@ def _near_pairs(state: FilterState, extents: Array, segments: Segments, margin: 
 
 def _innovations(state: FilterState, segments: Segments, segment: IntArray, line: IntArray) -> tuple[Array, Array]:
     """Innovations (k, 2) of pairs and the covariance (2 k, 2 k) of all of them stacked, correlations included."""
-    k = len(line)
-    lines, column = np.unique(line, return_inverse=True)
-    index = np.r_[np.arange(3), (3 + 2 * lines[:, None] + np.arange(2)).ravel()]
-    P = gather(state.covariance, index)
-    H = np.zeros((k, 2, len(index)))
-    by_pose, by_line = line_jacobians(state.pose, state.lines[line, 0])
-    pair, at = np.arange(k), 3 + 2 * column
-    H[..., :3] = by_pose
-    H[pair, :, at], H[pair, :, at + 1] = by_line[..., 0], by_line[..., 1]
-    innovation = segments.parameters[segment] - expected_lines(state.pose, state.lines[line])
+    P = gather(state.covariance, state_index(line))
+    seen = state.lines[line]
+    H = stacked_jacobian(state.pose, seen[:, 0])
+    innovation = segments.parameters[segment] - expected_lines(state.pose, seen)
     innovation[:, 0] = se2.wrap(innovation[:, 0])
-    flat = H.reshape(2 * k, -1)
-    covariance = flat @ P @ flat.T
-    on_diagonal = covariance.reshape(k, 2, k, 2)
-    on_diagonal[np.arange(k), :, np.arange(k)] += segments.covariances[segment]
+    covariance = H @ P @ H.T
+    add_blocks(covariance, segments.covariances[segment])
     return innovation, covariance
 
 
@@ -114,14 +109,20 @@ def best_joint_match(candidates: Candidates, segments: Sequence[int], gate: floa
 
     This is joint compatibility branch and bound (Neira and Tardos 2001): exponential, hence for small groups.
     """
-    of_segment = candidates.of_segment()
+    return _best_joint_match(candidates, candidates.of_segment(), segments, gate)
+
+
+def _best_joint_match(
+    candidates: Candidates, of_segment: dict[int, list[int]], segments: Sequence[int], gate: float
+) -> list[int]:
     chosen: list[int] = []
     best: tuple[int, float, list[int]] = (0, 0.0, [])
 
     def descend(depth: int, distance: float) -> None:
         nonlocal best
-        if len(chosen) + len(segments) - depth < best[0]:
-            return
+        most = len(chosen) + len(segments) - depth
+        if most < best[0] or (most == best[0] and distance >= best[1]):
+            return  # a pair more never makes the distance less
         if depth == len(segments):
             if len(chosen) > best[0] or (len(chosen) == best[0] and distance < best[1]):
                 best = (len(chosen), distance, list(chosen))
@@ -150,8 +151,8 @@ def partial_compatibility(candidates: Candidates, order: Sequence[int], group_si
     whole: list[int] = []
     for start in range(0, len(seen), group_size):
         group = seen[start : start + group_size]
-        local = best_joint_match(candidates, group, gate)
-        if local and _compatible(candidates, whole + local, gate):
+        local = _best_joint_match(candidates, of_segment, group, gate)
+        if local and (not whole or _compatible(candidates, whole + local, gate)):
             whole += local
             continue
         nearest = [of_segment[s][0] for s in group]

@@ -5,6 +5,7 @@ downdate of rank 2 k (BLAS dsyrk) in place, which is fast and cannot lose symmet
 buffers: a state given to one of them must not be used afterwards, only the one returned.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -50,7 +51,7 @@ def initial_state(pose: Array | None = None, pose_covariance: Array | None = Non
 
 def pose_covariance(state: FilterState) -> Array:
     """(3, 3) of x, y, theta in map."""
-    return gather(state.covariance, np.arange(3))
+    return _block(state.covariance, 0, 3)
 
 
 def gather(covariance: Array, index: IntArray) -> Array:
@@ -59,13 +60,21 @@ def gather(covariance: Array, index: IntArray) -> Array:
     return covariance[row, column]
 
 
+def _block(covariance: Array, first: int, count: int) -> Array:
+    """(count, count) on the diagonal, from `first` on, full; for a few rows."""
+    out = covariance[first : first + count, first : first + count].copy()
+    for k in range(1, count):
+        out[:k, k] = out[k, :k]
+    return out
+
+
 def _columns(state: FilterState, first: int, count: int) -> Array:
-    """(size, count) columns of the full symmetric covariance."""
+    """(size, count) columns of the full symmetric covariance, for a few columns."""
     P, n, last = state.covariance, state.size, first + count
-    out = np.empty((n, count))
+    out = np.empty((count, n)).T
     out[last:] = P[last:n, first:last]
     out[:first] = P[first:last, :first].T
-    out[first:last] = gather(P, np.arange(first, last))
+    out[first:last] = _block(P, first, count)
     return out
 
 
@@ -76,7 +85,7 @@ def predict(state: FilterState, increment: Array, noise: Array) -> FilterState:
     """
     by_pose, by_motion = se2.compose_jacobians(state.pose, increment)
     P, n = state.covariance, state.size
-    P[:3, :3] = by_pose @ gather(P, np.arange(3)) @ by_pose.T + by_motion @ noise @ by_motion.T
+    P[:3, :3] = by_pose @ _block(P, 0, 3) @ by_pose.T + by_motion @ noise @ by_motion.T
     P[3:n, :3] = P[3:n, :3] @ by_pose.T
     state.mean[:3] = se2.compose(state.pose, increment)
     return state
@@ -85,8 +94,11 @@ def predict(state: FilterState, increment: Array, noise: Array) -> FilterState:
 def expected_lines(pose: Array, lines: Array) -> Array:
     """(m, 2) alpha, r of map lines (m, 2) as seen from the pose, Eq. (9)."""
     alpha, r = lines[:, 0], lines[:, 1]
-    seen_r = r - pose[0] * np.cos(alpha) - pose[1] * np.sin(alpha)
-    return np.stack([se2.wrap(alpha - pose[2]), seen_r], axis=1)
+    x, y, theta = pose.tolist()
+    out = np.empty((len(lines), 2))
+    out[:, 0] = se2.wrap(alpha - theta)
+    out[:, 1] = r - x * np.cos(alpha) - y * np.sin(alpha)
+    return out
 
 
 def line_jacobians(pose: Array, alpha: Array) -> tuple[Array, Array]:
@@ -103,6 +115,30 @@ def line_jacobians(pose: Array, alpha: Array) -> tuple[Array, Array]:
     return by_pose, by_line
 
 
+def stacked_jacobian(pose: Array, alpha: Array) -> Array:
+    """(2 k, 3 + 2 k) of lines seen from the pose, by the pose and by each of the lines (k,) in turn, Eq. (10)."""
+    k, pair = len(alpha), np.arange(len(alpha))
+    by_pose, by_line = line_jacobians(pose, alpha)
+    H = np.zeros((k, 2, 3 + 2 * k))
+    H[..., :3] = by_pose
+    H[..., 3:].reshape(k, 2, k, 2)[pair, :, pair] = by_line
+    return H.reshape(2 * k, -1)
+
+
+def add_blocks(matrix: Array, blocks: Array) -> None:
+    """Add blocks (k, 2, 2) to those on the diagonal of a matrix (2 k, 2 k), in place."""
+    k, pair = len(blocks), np.arange(len(blocks))
+    matrix.reshape(k, 2, k, 2)[pair, :, pair] += blocks
+
+
+def state_index(lines: IntArray) -> IntArray:
+    """(3 + 2 k,) where the pose and the lines (k,) stand in the state."""
+    index = np.arange(3 + 2 * len(lines))
+    index[3::2] = 3 + 2 * lines
+    index[4::2] = 4 + 2 * lines
+    return index
+
+
 def update(state: FilterState, lines: IntArray, observed: Array, noise: Array) -> tuple[FilterState, float]:
     """Correct by the matched pairs of a scan at once, linearised at the state as it is, Eq. (11)-(15).
 
@@ -113,18 +149,17 @@ def update(state: FilterState, lines: IntArray, observed: Array, noise: Array) -
     if k == 0:
         return state, 0.0
     seen = state.lines[lines]
-    by_pose, by_line = line_jacobians(state.pose, seen[:, 0])
     innovation = observed - expected_lines(state.pose, seen)
     innovation[:, 0] = se2.wrap(innovation[:, 0])
-    first = 3 + 2 * lines
-    cross = _columns(state, 0, 3) @ by_pose.reshape(2 * k, 3).T
-    for pair, column in enumerate(first.tolist()):
-        cross[:, 2 * pair : 2 * pair + 2] += _columns(state, column, 2) @ by_line[pair].T
-    of_lines = cross[first[:, None] + np.arange(2)]
-    S = by_pose.reshape(2 * k, 3) @ cross[:3] + (by_line @ of_lines).reshape(2 * k, 2 * k)
-    on_diagonal = S.reshape(k, 2, k, 2)
-    on_diagonal[np.arange(k), :, np.arange(k)] += noise
-    return _correct(state, cross, S, innovation.ravel())
+    columns = np.empty((3 + 2 * k, state.size))
+    columns[:3] = _columns(state, 0, 3).T
+    for pair, line in enumerate(lines.tolist()):
+        columns[3 + 2 * pair : 5 + 2 * pair] = _columns(state, 3 + 2 * line, 2).T
+    H = stacked_jacobian(state.pose, seen[:, 0])
+    cross = H @ columns
+    S = cross[:, state_index(lines)] @ H.T
+    add_blocks(S, noise)
+    return _correct(state, cross.T, S, innovation.ravel())
 
 
 def constrain_equal(state: FilterState, first: int, second: int, noise: Array) -> FilterState:
@@ -153,7 +188,7 @@ def _correct(state: FilterState, cross: Array, S: Array, innovation: Array) -> t
     whitened = dtrsv(L, innovation, lower=1)
     W = np.zeros((len(state.mean), len(innovation)), order="F")
     W[: state.size] = dtrsm(1.0, L, cross, side=1, lower=1, trans_a=1)
-    state.mean[: state.size] += W[: state.size] @ whitened
+    state.mean[:] += W @ whitened
     state.mean[2] = se2.wrap(state.mean[2])
     P = dsyrk(-1.0, W, beta=1.0, c=state.covariance, lower=1, overwrite_c=1)
     return FilterState(state.mean, P, state.size), float(whitened @ whitened)
@@ -162,9 +197,9 @@ def _correct(state: FilterState, cross: Array, S: Array, innovation: Array) -> t
 def augment(state: FilterState, observed: Array, noise: Array) -> FilterState:
     """Append a line seen at (2,) alpha, r in base_link with covariance `noise` (2, 2), Eq. (4)-(5)."""
     state = _with_room(state, state.size + 2)
-    x, y, theta = state.pose
-    alpha = observed[0] + theta
-    c, s = np.cos(alpha), np.sin(alpha)
+    x, y, theta = state.pose.tolist()
+    alpha = float(observed[0]) + theta
+    c, s = math.cos(alpha), math.sin(alpha)
     lever = y * c - x * s
     by_pose = np.array([[0.0, 0.0, 1.0], [c, s, lever]])
     by_observed = np.array([[1.0, 0.0], [lever, 1.0]])
@@ -186,11 +221,14 @@ def insert(state: FilterState, line: Array, covariance: Array) -> FilterState:
     return FilterState(state.mean, P, n + 2)
 
 
-def line_covariances(state: FilterState) -> Array:
-    """(m, 2, 2) marginal covariances of the lines."""
-    index = 3 + 2 * np.arange(len(state.lines))[:, None] + np.arange(2)
-    rows, columns = np.maximum(index[:, :, None], index[:, None]), np.minimum(index[:, :, None], index[:, None])
-    return state.covariance[rows, columns]
+def line_covariances(state: FilterState, lines: IntArray | None = None) -> Array:
+    """(m, 2, 2) marginal covariances of the lines, by default of all."""
+    first = 3 + 2 * (np.arange(len(state.lines)) if lines is None else lines)
+    out = np.empty((len(first), 2, 2))
+    out[:, 0, 0] = state.covariance[first, first]
+    out[:, 0, 1] = out[:, 1, 0] = state.covariance[first + 1, first]
+    out[:, 1, 1] = state.covariance[first + 1, first + 1]
+    return out
 
 
 def remove(state: FilterState, line: int) -> FilterState:
@@ -211,7 +249,7 @@ def _with_room(state: FilterState, size: int) -> FilterState:
     capacity = len(state.mean)
     if size <= capacity:
         return state
-    grown = capacity + max(GROWTH, capacity // 4)
+    grown = capacity + GROWTH
     mean, covariance = np.zeros(grown), np.zeros((grown, grown), order="F")
     mean[:capacity], covariance[:capacity, :capacity] = state.mean, state.covariance
     return FilterState(mean, covariance, state.size)

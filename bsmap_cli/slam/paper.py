@@ -72,7 +72,9 @@ def line_step(state: FilterState, landmarks: Landmarks, segments: Segments, step
     state, nis = filter.update(state, line, segments.parameters[segment], segments.covariances[segment])
     landmarks = extend(state, follow(landmarks, before, state.lines), segments, segment, line, step)
     # A segment that fits a line alone but not jointly is neither trusted nor stored a second time.
-    unknown = np.setdiff1d(np.arange(len(segments.scan)), candidates.segment)
+    fits = np.zeros(len(segments.scan), bool)
+    fits[candidates.segment] = True
+    unknown = np.flatnonzero(~fits)
     first_new = len(landmarks.hits)
     for new in unknown:
         state = filter.augment(state, segments.parameters[new], segments.covariances[new])

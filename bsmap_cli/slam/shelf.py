@@ -49,7 +49,7 @@ def look_around(
     near = distances(state.pose, shelf.lines, shelf.landmarks.extents) < REACH
     far = distances(state.pose, state.lines, landmarks.extents) > REACH
     aside = np.flatnonzero(far & (step - landmarks.last_seen > UNSEEN))
-    covariances = filter.line_covariances(state)[aside]
+    covariances = filter.line_covariances(state, aside)
     laid = Shelf(state.lines[aside].copy(), covariances, take(landmarks, aside))
     for line in aside[::-1]:
         state, landmarks = discard(state, landmarks, int(line))

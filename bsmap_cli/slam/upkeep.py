@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bsmap_cli.core import se2
-from bsmap_cli.core.gaussian import chi2_gate
+from bsmap_cli.core.gaussian import chi2_gate, squared_distance_2
 from bsmap_cli.core.table import take
 from bsmap_cli.model import Array, IntArray, LineMap
 from bsmap_cli.slam.filter import FilterState, constrain_equal, line_covariances, remove
@@ -46,16 +46,17 @@ def extend(
     if len(line) == 0:
         return landmarks
     extents, hits, last_seen = landmarks.extents.copy(), landmarks.hits.copy(), landmarks.last_seen.copy()
-    alpha = segments.parameters[segment, 0]
-    n, t = np.stack([np.cos(alpha), np.sin(alpha)], -1), np.stack([-np.sin(alpha), np.cos(alpha)], -1)
-    map_alpha = state.lines[line, 0]
-    map_t = np.stack([-np.sin(map_alpha), np.cos(map_alpha)], -1)
-    for end in (0, 1):  # the segment's end points, carried into the map and measured along the stored line
-        point = n * segments.parameters[segment, 1:] + t * segments.extents[segment, end : end + 1]
-        along = np.einsum("ij,ij->i", se2.transform(state.pose, point), map_t)
-        np.minimum.at(extents[:, 0], line, along)
-        np.maximum.at(extents[:, 1], line, along)
-    hits[np.unique(line)] += 1
+    # The segment's end points, carried into the map and measured along the stored line.
+    x, y, theta = state.pose.tolist()
+    alpha, map_alpha = segments.parameters[segment, 0] + theta, state.lines[line, 0]
+    turn = alpha - map_alpha
+    shift = y * np.cos(map_alpha) - x * np.sin(map_alpha) + segments.parameters[segment, 1] * np.sin(turn)
+    along = segments.extents[segment] * np.cos(turn)[:, None] + shift[:, None]
+    np.minimum.at(extents[:, 0], line, along.min(axis=1))
+    np.maximum.at(extents[:, 1], line, along.max(axis=1))
+    seen = np.zeros(len(hits), bool)
+    seen[line] = True
+    hits += seen
     last_seen[line] = step
     return Landmarks(extents, hits, last_seen)
 
@@ -71,6 +72,8 @@ def follow(landmarks: Landmarks, before: Array, after: Array) -> Landmarks:
 
 def append(landmarks: Landmarks, extents: Array, step: int) -> Landmarks:
     """Landmarks with new lines of extents (k, 2), seen for the first time."""
+    if len(extents) == 0:
+        return landmarks
     ones = np.ones(len(extents), int)
     return Landmarks(
         np.r_[landmarks.extents, extents], np.r_[landmarks.hits, ones], np.r_[landmarks.last_seen, step * ones]
@@ -82,8 +85,8 @@ def prune(
 ) -> tuple[FilterState, Landmarks]:
     """Forget lines seen in fewer than `fewest_hits` scans and not in the last `patience` key scans: clutter, people."""
     stale = (landmarks.hits < fewest_hits) & (step - landmarks.last_seen > patience)
-    for line in np.flatnonzero(stale)[::-1]:
-        state, landmarks = discard(state, landmarks, int(line))
+    for line in stale.nonzero()[0][::-1].tolist():
+        state, landmarks = discard(state, landmarks, line)
     return state, landmarks
 
 
@@ -130,8 +133,7 @@ def _first_joinable(
     S = C[:, :2, :2] + C[:, 2:, 2:] - C[:, :2, 2:] - C[:, 2:, :2] + noise
     difference = state.lines[pairs[:, 0]] - state.lines[pairs[:, 1]]
     difference[:, 0] = se2.wrap(difference[:, 0])
-    distance = np.einsum("ki,ki->k", difference, np.linalg.solve(S, difference[..., None])[..., 0])
-    passing = np.flatnonzero(distance < chi2_gate(gate, 2))
+    passing = np.flatnonzero(squared_distance_2(difference, S) < chi2_gate(gate, 2))
     return tuple(pairs[passing[0]].tolist()) if len(passing) else None
 
 

@@ -38,9 +38,24 @@ class OrientedPoints(NamedTuple):
     normal: Array
 
     def moved(self, pose: Array) -> "OrientedPoints":
-        """In the frame in which `pose` (3,), or poses that broadcast (..., 1, 3), are given."""
-        turn = pose * [0.0, 0.0, 1.0]
-        return OrientedPoints(se2.transform(pose, self.xy), se2.transform(turn, self.normal))
+        """In the frame in which the pose (3,) is given."""
+        R = _row_rotation(float(pose[2]))
+        return OrientedPoints(self.xy @ R + pose[:2], self.normal @ R)
+
+    def moved_each(self, poses: Array, owner: IntArray) -> "OrientedPoints":
+        """Each point by the pose, of these (k, 3), that `owner` (n,) tells."""
+        c, s = np.cos(poses[:, 2])[owner], np.sin(poses[:, 2])[owner]
+        xy, normal = np.empty((len(owner), 2)), np.empty((len(owner), 2))
+        for out, (x, y) in ((xy, self.xy.T), (normal, self.normal.T)):
+            out[:, 0], out[:, 1] = c * x - s * y, s * x + c * y
+        xy += poses[owner, :2]
+        return OrientedPoints(xy, normal)
+
+
+def _row_rotation(theta: float) -> Array:
+    """(2, 2) R with which points in rows are turned by theta: xy @ R."""
+    c, s = math.cos(theta), math.sin(theta)
+    return np.array([[c, s], [-s, c]])
 
 
 class Target(NamedTuple):
@@ -219,8 +234,7 @@ def _has_moved(before: Floats, pose: Floats) -> bool:
 
 def _pair(source: OrientedPoints, target: Target, pose: Floats, reach: float) -> _Pairs:
     """Each point of the source, at the pose, with the nearest of the target that faces its way."""
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    R = np.array([[c, s], [-s, c]])
+    R = _row_rotation(pose[2])
     distance, nearest = nearest_points(target, source.xy @ R + pose[:2], reach)
     lines, facing = target.lines[nearest], source.normal @ R
     same = np.flatnonzero(lines[:, 0] * facing[:, 0] + lines[:, 1] * facing[:, 1] > SAME_WAY)
@@ -246,8 +260,9 @@ def search(
     step = max(SEARCH_STEP, span / SEARCH_STEPS)
     angles = initial[2] + _centred(turn, SEARCH_ANGLE)
     shifts = np.stack(np.meshgrid(_centred(span, step), _centred(span, step)), axis=-1).reshape(-1, 2)
-    turned = points.moved(np.stack([0 * angles, 0 * angles, angles], axis=-1)[:, None])
-    score = _scores(target, turned.xy + initial[:2], turned.normal, np.rint(shifts / step).astype(int), step)
+    turns = np.array([_row_rotation(angle) for angle in angles.tolist()])
+    xy, normal = points.xy @ turns + initial[:2], points.normal @ turns
+    score = _scores(target, xy, normal, np.rint(shifts / step).astype(int), step)
     order = np.argsort(-score.ravel(), kind="stable")[:best]
     return [np.array([*(initial[:2] + shifts[k % len(shifts)]), angles[k // len(shifts)]]) for k in order]
 

@@ -69,7 +69,7 @@ def small_map(look: Search, centre: int, keys: Sequence[int], step: int = 1) -> 
     """Every `step`-th point of key scans in the frame of one of them."""
     points = take(joined([look.points[j] for j in keys]), slice(None, None, step))
     owner = np.repeat(np.arange(len(keys)), [len(look.points[j].xy) for j in keys])[::step]
-    return points.moved(se2.between(look.poses[centre], look.poses[list(keys)])[owner])
+    return points.moved_each(se2.between(look.poses[centre], look.poses[list(keys)]), owner)
 
 
 def register(

@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from bsmap_cli.errors import BadInputError, CannotWriteError, MissingInputError
 from bsmap_cli.io import ros
 from bsmap_cli.io.artifact import Provenance, read_provenance
 from bsmap_cli.io.log import OdometryRow, ScanRow, describe_log, read_log, write_log, write_scans
-from bsmap_cli.io.mcap_file import ros_writer
+from bsmap_cli.io.mcap_file import read_messages, ros_writer
 from bsmap_cli.model import LaserScans
 from bsmap_cli.params import LogParams
 
@@ -71,6 +72,12 @@ def test_log_comes_back_as_it_was_written(log: Path) -> None:
     assert read.odometry is not None
     np.testing.assert_allclose(read.odometry[:, :2], poses[::2, :2], atol=1e-12)
     np.testing.assert_allclose(np.exp(1j * read.odometry[:, 2]), np.exp(1j * poses[::2, 2]), atol=1e-12)
+
+
+def test_messages_are_those_of_the_mcap_packages_reader(log: Path) -> None:
+    with open(log, "rb") as file:
+        theirs = [(c.topic, m.log_time, m.data) for _, c, m in make_reader(file).iter_messages(log_time_order=False)]
+    assert [(m.topic, m.log_time, m.data) for m in read_messages(log)] == theirs
 
 
 def test_same_log_same_bytes_and_provenance_in_front(tmp_path: Path) -> None:

@@ -1,10 +1,10 @@
-"""ROS messages that differ by their numbers alone, encoded at once."""
+"""ROS messages that differ by their numbers alone, encoded at once and read without decoding them as a whole."""
 
 import numpy as np
 import pytest
 
 from bsmap_cli.io import ros
-from bsmap_cli.model import Array
+from bsmap_cli.model import Array, LaserScans
 
 TIMES = 1_700_000_000_123_456_789 + 987_654_321 * np.arange(7)
 
@@ -50,3 +50,71 @@ def test_encoded_path_is_that_of_its_message(count):
     ]
     message = ros.make(ros.PATH, header=ros.header(5, "map"), poses=stamped)
     assert ros.encode_path(TIMES[:count], poses, 5) == ros.encode(message)
+
+
+def laser(frame_id: str = "laser", angle_min: float = -1.5) -> LaserScans:
+    return LaserScans(
+        TIMES, np.ones((len(TIMES), 5), np.float32), angle_min, 0.1, 1e-4, 0.1, 30.0, np.eye(4), frame_id, "/scan"
+    )
+
+
+def scan(ranges: Array, **kwargs: object) -> bytes:
+    return ros.encode(ros.scan_of(laser(**kwargs), int(TIMES[1]), ranges.astype(np.float32)))
+
+
+def test_scans_alike_are_read_as_they_are_decoded():
+    first, second = (scan(np.random.default_rng(k).uniform(1, 9, 5)) for k in (0, 1))
+    alike = ros.alike_scans(first, ros.decode(first, ros.LASER_SCAN))
+    assert alike is not None
+    assert alike.fits(second)
+    decoded = ros.decode(second, ros.LASER_SCAN)
+    np.testing.assert_array_equal(ros.ranges_at(second, alike.start, 5), decoded.ranges)
+    assert ros.stamp_at(second) == ros.time_of(decoded) == TIMES[1]
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        scan(np.arange(6.0)),
+        scan(np.arange(5.0), angle_min=-1.4),
+        scan(np.arange(5.0), frame_id="other"),
+        scan(np.arange(5.0), frame_id="laser_front"),
+        scan(np.arange(5.0))[:-1],
+        b"\x00\x00" + scan(np.arange(5.0))[2:],
+        b"",
+    ],
+)
+def test_scan_of_another_layout_does_not_fit(other):
+    data = scan(np.arange(5.0))
+    alike = ros.alike_scans(data, ros.decode(data, ros.LASER_SCAN))
+    assert alike is not None
+    assert not alike.fits(other)
+
+
+def test_range_that_became_an_intensity_does_not_fit():
+    message = ros.scan_of(laser(), int(TIMES[0]), np.ones(5, np.float32))
+    data = ros.encode(message)
+    alike = ros.alike_scans(data, ros.decode(data, ros.LASER_SCAN))
+    message.ranges, message.intensities = message.ranges[:4], np.ones(1, np.float32)
+    assert alike is not None
+    assert len(ros.encode(message)) == len(data)
+    assert not alike.fits(ros.encode(message))
+
+
+def test_odometry_alike_is_read_as_it_is_decoded():
+    first, second = (ros.odometry_message(int(TIMES[k]), (0.1 * k, -0.2, 3.0 - k)) for k in (0, 1))
+    second.pose.covariance[:] = np.arange(36)
+    data, other = ros.encode(first), ros.encode(second)
+    alike = ros.alike_odometry(data, ros.decode(data, ros.ODOMETRY))
+    assert alike is not None
+    assert alike.fits(other)
+    assert ros.pose_at(other, alike.start) == ros.planar_pose(ros.decode(other, ros.ODOMETRY).pose.pose)
+    renamed = ros.encode(ros.odometry_message(int(TIMES[0]), (0, 0, 0), "map!"))
+    assert len(renamed) == len(data)
+    assert not alike.fits(renamed)
+
+
+def test_big_endian_messages_and_empty_scans_are_decoded_as_a_whole():
+    empty, data = scan(np.zeros(0)), scan(np.arange(5.0))
+    assert ros.alike_scans(empty, ros.decode(empty, ros.LASER_SCAN)) is None
+    assert ros.alike_scans(b"\x00\x00" + data[2:], ros.decode(data, ros.LASER_SCAN)) is None

@@ -8,13 +8,16 @@ import logging
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import zstandard
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError
+from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Message, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.writer import CompressionType, Writer
 
 from bsmap_cli import __version__
@@ -27,6 +30,7 @@ logger = logging.getLogger("bsmap")
 
 # What damage looks like to the mcap package; its CRCValidationError is a ValueError.
 _DAMAGE = (McapError, ValueError, KeyError, IndexError, OverflowError, MemoryError, struct.error, zstandard.ZstdError)
+_RECORD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<HIQQ")
 _CHUNK_BYTES = 256 * 1024  # small, for damage costs a chunk
 # For `ros2 bag play`: late subscribers get /tf_static too.
 _LATCHED_QOS = "- {history: 1, depth: 1, reliability: 1, durability: 1}\n"
@@ -96,7 +100,7 @@ def _sound_records(path: Path, damage: list[str]) -> Iterator[Any]:
         while True:
             try:
                 record = next(records)
-                parts = breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]
+                parts = _unpacked(record) if isinstance(record, Chunk) else [record]
             except StopIteration:
                 return
             except _DAMAGE as error:
@@ -105,6 +109,27 @@ def _sound_records(path: Path, damage: list[str]) -> Iterator[Any]:
                 damage[0] = damage[0] or what
             else:
                 yield from parts
+
+
+def _unpacked(chunk: Chunk) -> list[Any]:
+    """Records of a chunk; its messages read at once, which takes a third of the time that field by field does."""
+    stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+    data, at, records = stream.read(size) if size else b"", 0, []
+    while at < size:
+        opcode, length = _RECORD.unpack_from(data, at)
+        at, end = at + _RECORD.size, at + _RECORD.size + length
+        if end > size:
+            raise EndOfFile()
+        if opcode == Opcode.MESSAGE:
+            channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(data, at)
+            content = data[at + _MESSAGE.size : end]
+            records.append(Message(channel, log_time, content, publish_time, sequence))
+        elif opcode == Opcode.CHANNEL:
+            records.append(Channel.read(ReadDataStream(BytesIO(data[at:end]))))
+        elif opcode == Opcode.SCHEMA:
+            records.append(Schema.read(ReadDataStream(BytesIO(data[at:end]))))
+        at = end
+    return records
 
 
 class RosWriter:

@@ -3,9 +3,11 @@
 Types and their definitions come from rosbags' type store (ROS 2 Humble), (de)serialised as CDR.
 """
 
+import math
+import struct
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,6 +26,7 @@ NUMBERS = "std_msgs/msg/Float64MultiArray"
 
 NANOSECONDS = 1_000_000_000
 _STAMP_MARK = 1_234_567_890_123_456_789
+_STAMP, _POSE, _ODOMETRY_NUMBERS = struct.Struct("<iI"), struct.Struct("<7d"), 7 + 36 + 6 + 36
 # Rows and columns of x, y, theta in the 6 x 6 covariance of a ROS pose (x, y, z, roll, pitch, yaw).
 PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
 
@@ -73,6 +76,63 @@ def encode_alike(message_of: Callable[[int, Array], Any], time_ns: IntArray, num
 def decode(data: bytes, type_name: str) -> Any:
     """Message from its CDR."""
     return typestore().deserialize_cdr(data, type_name)
+
+
+class Alike(NamedTuple):
+    """What messages of a topic have in common if they differ by stamp and by the numbers from a place on alone.
+
+    Then these can be read from where they stand in the CDR, without decoding the rest of each message again.
+
+    size : bytes of a message.  common : places that are alike in all, and what stands there.  start : of the numbers.
+    """
+
+    size: int
+    common: tuple[tuple[slice, bytes], ...]
+    start: int
+
+    def fits(self, data: bytes) -> bool:
+        """Whether a message is one of them."""
+        return len(data) == self.size and all(data[place] == known for place, known in self.common)
+
+
+def alike_scans(data: bytes, scan: Any) -> Alike | None:
+    """Those that have frame, angles, limits and numbers of ranges and intensities of this LaserScan; None: ask each."""
+    count = len(scan.ranges)
+    start = len(data) - 4 * (count + 1 + len(scan.intensities))
+    alike = _alike(data, scan, start, start + 4 * count, 4)
+    return alike if alike and count and ranges_at(data, start, count).tobytes() == scan.ranges.tobytes() else None
+
+
+def alike_odometry(data: bytes, odometry: Any) -> Alike | None:
+    """Those that have the frames of this Odometry, of which all that follows is of one length; None: ask each."""
+    start = len(data) - 8 * _ODOMETRY_NUMBERS
+    alike = _alike(data, odometry, start, len(data), 0)
+    return alike if alike and pose_at(data, start) == planar_pose(odometry.pose.pose) else None
+
+
+def _alike(data: bytes, message: Any, start: int, end: int, after: int) -> Alike | None:
+    """Alike but for the stamp and what is from `start` to `end`; `after`: bytes that tell the length of the rest."""
+    if data[:2] != b"\x00\x01" or start < 12 or stamp_at(data) != time_of(message):
+        return None
+    places = slice(0, 4), slice(12, start), slice(end, end + after)
+    return Alike(len(data), tuple((place, data[place]) for place in places), start)
+
+
+def stamp_at(data: bytes) -> int:
+    """Header stamp, ns, of a message that begins with its header."""
+    seconds, nanoseconds = _STAMP.unpack_from(data, 4)
+    return int(seconds) * NANOSECONDS + int(nanoseconds)
+
+
+def pose_at(data: bytes, start: int) -> tuple[float, float, float]:
+    """x, y, yaw of the geometry_msgs/Pose at a place."""
+    x, y, _, *quaternion = _POSE.unpack_from(data, start)
+    return x, y, _yaw(*quaternion)
+
+
+def ranges_at(data: bytes, start: int, count: int) -> NDArray[np.float32]:
+    """So many ranges (count,) at a place."""
+    return np.frombuffer(data, "<f4", count, start)
 
 
 def make(type_name: str, **fields: Any) -> Any:
@@ -208,8 +268,12 @@ def encode_path(time_ns: IntArray, poses: Array, start: int) -> bytes:
 def planar_pose(pose: Any) -> tuple[float, float, float]:
     """x, y, yaw of a geometry_msgs/Pose."""
     q = pose.orientation
-    yaw = np.arctan2(2 * (q.w * q.z + q.x * q.y), q.w**2 + q.x**2 - q.y**2 - q.z**2)
-    return pose.position.x, pose.position.y, float(yaw)
+    return pose.position.x, pose.position.y, _yaw(q.x, q.y, q.z, q.w)
+
+
+def _yaw(x: float, y: float, z: float, w: float) -> float:
+    """Yaw of a quaternion of any length."""
+    return math.atan2(2 * (w * z + x * y), w**2 + x**2 - y**2 - z**2)
 
 
 def pose_with_covariance(pose: Any, covariance: Array | None = None) -> Any:

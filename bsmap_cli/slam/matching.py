@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from bsmap_cli.core import se2
 from bsmap_cli.model import Array, IntArray
 from bsmap_cli.slam.segments import ScanPoints
 

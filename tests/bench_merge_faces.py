@@ -9,10 +9,11 @@ mean, 95%, max: millimetres of samples of the map to the true scene, laid over i
 trajectory. hit: share of the beams' true ends within 2 cm of the map.
 bytes: of the map as .json.gz over 12 bytes a point of the cloud.
 
-Creases of the merged map: T: corners in which the border of a face goes straight on. gap: largest distance of a vertex
-of a face's mesh along a crease to the nearest one of the other face. edges: of the true scene, samples with ends of
-beams within 8 cm on both sides; share within 2 cm of a crease, and median distance, of the map laid over the scene by
-the trajectory. Before: the creases of all data sets.
+Creases of the merged map: T: corners in which the border of a face goes straight on. sides: of all creases. open:
+those along which the borders of the two faces' meshes are not the same vertices to the last bit. gap: largest distance
+between the two borders. edges: of the true scene, samples with ends of beams within 8 cm on both sides; share within
+2 cm of a crease, and median distance, of the map laid over the scene by the trajectory. Before: the creases of all data
+sets.
 """
 
 import sys
@@ -24,6 +25,7 @@ from pathlib import Path
 import numpy as np
 from scenes import simulated, true_slam_map
 from scipy.spatial import cKDTree
+from shared_creases import seams
 from true_edges import distance_to_lines, seen_edges
 
 from bsmap_cli import open3d_loader
@@ -38,8 +40,6 @@ from bsmap_cli.merge import merge_surfaces
 from bsmap_cli.params import CloudParams, FitParams, MergeParams, SlamParams
 from bsmap_cli.slam import run_slam
 
-NEAR = 0.002
-"""Metres from a crease to the vertices of a mesh that lie along it."""
 DENSITY = 400.0
 """Samples a square metre for areas."""
 
@@ -164,29 +164,10 @@ def straight_corners(surface_map):
     return len(found)
 
 
-def along(mesh, points):
-    """Vertices (k, 3) at the border of a mesh that lie along a polyline, at its ends only those that are its ends.
-
-    An open border that begins at the end of a crease may have a vertex nearby.
-    """
-    edges = np.sort(np.concatenate([mesh.triangles[:, k] for k in ([0, 1], [1, 2], [2, 0])]), axis=1)
-    single, count = np.unique(edges, axis=0, return_counts=True)
-    border = mesh.vertices[np.unique(single[count == 1])]
-    at_end = cKDTree(points[[0, -1]]).query(border)[0]
-    return border[(distance_to_lines(border, [points]) < NEAR) & ((at_end == 0.0) | (at_end > NEAR))]
-
-
-def largest_gap(surface_map):
-    """Metres, between the vertices that both faces have along a crease."""
+def seam_figures(surface_map):
     meshes = dict(zip([s.name for s in surface_map.surfaces], tessellate_map(surface_map, 0.002), strict=True))
-    worst = 0.0
-    for crease in surface_map.creases:
-        a, b = (along(meshes[name], crease.points) for name in crease.surfaces)
-        ends = [cKDTree(some).query(crease.points[[0, -1]])[0].max() if len(some) else np.inf for some in (a, b)]
-        worst = max(worst, *ends)
-        if np.isfinite(worst):
-            worst = max(worst, cKDTree(a).query(b)[0].max(), cKDTree(b).query(a)[0].max())
-    return worst
+    found = seams(surface_map.creases, meshes)
+    return f"sides {found.sides}, open {found.open}, gap {1e3 * found.gap:g} mm"
 
 
 def edge_figures(surface_map, samples, pose):
@@ -219,7 +200,7 @@ def bench(scene, seed, true_poses):
     edges = seen_edges(simulation.vertices, simulation.triangles, ends)
     print(
         f"  creases {len(fitted.creases)} -> {len(merged.creases)}, corners {len(merged.corners)}"
-        f" ({straight_corners(merged)} T), free ends {free_ends(merged)}, gap {1e3 * largest_gap(merged):g} mm;"
+        f" ({straight_corners(merged)} T), free ends {free_ends(merged)}, {seam_figures(merged)};"
         f" before: {edge_figures(fitted, edges, poses[-1])}; after: {edge_figures(merged, edges, poses[-1])}"
     )
     seen, shown = seen_area(simulation, ends), shown_area(simulation, clean, first)

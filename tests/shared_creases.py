@@ -39,7 +39,7 @@ class Borders:
             self.next[tuple(b)].add(tuple(a))
 
     def chain(self, start, end):
-        """Vertices (k, 3) along the border, the fewest from start to end near the straight line; None where none lead."""
+        """Vertices (k, 3) along the border, the fewest from start to end near the straight line; else None."""
         start, end = tuple(start.tolist()), tuple(end.tolist())
         before, waiting = {start: start}, deque([start])
         while waiting and end not in before:

@@ -116,8 +116,10 @@ def _joined(runs: list[Run], loop: Array, curves: Mapping[int, Curve], gap: floa
 def _runs_on(one: Run, other: Run, loop: Array, curve: Curve, gap: float) -> bool:
     if one.curve != other.curve or abs(other.start - one.end) > 2.0 * gap:
         return False
+    # Around the end of a narrow strip the loop comes back along the other side of it, near the curve, too.
+    onward = one.sign == other.sign and (other.start - one.end) * one.sign > -APART
     off = locate(curve, open_part(loop, one.last, other.first))[1]
-    return bool(off.max(initial=0.0) < gap / 2.0)
+    return bool(off.max(initial=0.0) < (gap if onward else gap / 2.0))
 
 
 def open_part(loop: Array, first: int, last: int) -> Array:

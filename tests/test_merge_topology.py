@@ -195,6 +195,47 @@ def test_edge_that_nobody_saw_is_found_where_both_walls_together_come_within_the
     assert whole_mesh(result).is_watertight
 
 
+def below(surface, *corners):
+    """The plate, its side along v = 0 with more corners: metres along u and v, and whether the crease runs on."""
+    loop, P = surface.trims[0], surface.control_points
+    size = np.linalg.norm([P[1, 0] - P[0, 0], P[0, 1] - P[0, 0]], axis=1)
+    more = np.array([corner[:2] for corner in corners]) / size
+    marks = [loop.creases[0] if on else -1 for *_, on in corners]
+    parameters = np.insert(loop.parameters, [1] * len(more), more, axis=0)
+    return replace(surface, trims=(TrimLoop(parameters, np.insert(loop.creases, [1] * len(more), marks)),))
+
+
+def notched(surface, depth):
+    """The plate without a triangle 10 cm wide at its side v = 0: what a scan lacks whose beams miss the crease."""
+    return below(surface, (2.0, 0.0, False), (2.05, depth, False), (2.1, 0.0, True))
+
+
+@pytest.mark.parametrize(("depths", "creases"), [((0.07, 0.08), 12), ((0.02, 0.08), 12), ((0.07, 0.15), 13)])
+def test_notch_of_one_scan_at_a_crease_is_closed(depths, creases):
+    whole = boxed("a", LOW, HIGH)
+    lacking = dict(zip(("a/floor", "a/south"), depths, strict=True))
+    faces = tuple(notched(s, lacking[s.name]) if s.name in lacking else s for s in whole.surfaces)
+    result = merged(replace(whole, surfaces=faces))
+    assert len(result.creases) == creases
+    check_creases(result)
+    assert whole_mesh(result).is_watertight == (creases == 12)
+
+
+@pytest.mark.parametrize("high", [0.015, 0.025, 0.06])
+def test_narrow_strip_of_a_wall_below_a_cabinet_keeps_its_crease_and_its_area(high):
+    whole = boxed("a", LOW, HIGH, ("floor", "south"))
+    strip = (3.0, 0.0, False), (3.0, high, False), (1.0, high + 0.002, False), (1.0, 2.5, False)
+    cut = below(whole.surfaces[1], *strip)
+    loop = cut.trims[0]
+    south = replace(cut, trims=(TrimLoop(np.delete(loop.parameters, [5, 6], 0), np.delete(loop.creases, [5, 6])),))
+    result = merged(replace(whole, surfaces=(whole.surfaces[0], south)))
+    [crease] = result.creases
+    assert np.ptp(crease.points[:, 0]) == pytest.approx(3.0, abs=1e-6)
+    check_creases(result)
+    mesh = tessellate_map(result, 0.002)[[s.name for s in result.surfaces].index("a/south")]
+    assert trimesh.Trimesh(mesh.vertices, mesh.triangles).area == pytest.approx(2.5 + 2.0 * high + 0.002, abs=0.003)
+
+
 def test_walls_that_hardly_bend_meet_between_their_corners():
     """Two walls at six degrees, the second one seen from 3 cm on: no data set saw their edge."""
     first = plate("a/1", (0, 0, 0), (2, 0, 0), (0, 0, 2.5), (2, 1.5), (0, -1, 1, -1))

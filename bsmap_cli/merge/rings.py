@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bsmap_cli.merge.curves import Curve, between, locate
+from bsmap_cli.merge.regions import GRID
 from bsmap_cli.merge.runs import Meeting, Run, open_part
 from bsmap_cli.model import Array, IntArray
 
@@ -88,8 +89,9 @@ def _open_way(loop: Loop, k: int, curves: Sequence[Curve], knots: Sequence[Knots
     other = loop.runs[following]
     way = open_part(loop.points, one.last, other.first)[1:-1]
     end, start = knots_of_run(loop, k, knots[one.curve])[1], knots_of_run(loop, following, knots[other.curve])[0]
-    way = _off_run(way, curves[one.curve], knots[one.curve].t[end], one.sign)
-    return _off_run(way[::-1], curves[other.curve], knots[other.curve].t[start], -other.sign)[::-1]
+    way = _off_run(way, curves[one.curve], one.end, knots[one.curve].t[end], one.sign)
+    back = _off_run(way[::-1], curves[other.curve], other.start, knots[other.curve].t[start], -other.sign)
+    return back[::-1]
 
 
 def _without_doubles(points: Array, edges: IntArray) -> Ring:
@@ -98,10 +100,14 @@ def _without_doubles(points: Array, edges: IntArray) -> Ring:
     return Ring(points[away], edges[away])
 
 
-def _off_run(way: Array, curve: Curve, end: float, sign: int) -> Array:
-    """The way (k, 3) on from the end of a run, without what of its beginning doubles back along the run."""
+def _off_run(way: Array, curve: Curve, was: float, end: float, sign: int) -> Array:
+    """The way (k, 3) on from the end of a run, without what of its beginning lies beside that by which the run became
+    longer. What doubles back farther is the other side of a narrow strip.
+
+    was : length along the curve at which the run ended.
+    """
     if not len(way):
         return way
     t, off = locate(curve, way)
-    on = (off < curve.beside) & ((t - end) * sign <= 0.0)
+    on = (off < curve.beside) & ((t - end) * sign <= 0.0) & ((t - was) * sign > GRID)
     return way[len(way) if on.all() else int(np.argmin(on)) :]

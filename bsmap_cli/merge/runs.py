@@ -45,7 +45,7 @@ def find_runs(loop: Array, curves: Mapping[int, Curve], gap: float) -> list[Run]
     Parameters
     ----------
     curves : those of its face under their numbers.
-    gap : metres; a loop that leaves a curve by less than half of it, for less than twice of it, runs on along it.
+    gap : metres; a loop that leaves a curve by less than that, for less than twice of it, runs on along it.
     """
     along = _curves_of_sides(loop, curves, gap)
     starts = np.flatnonzero(along != np.roll(along, 1))
@@ -114,12 +114,14 @@ def _joined(runs: list[Run], loop: Array, curves: Mapping[int, Curve], gap: floa
 
 
 def _runs_on(one: Run, other: Run, loop: Array, curve: Curve, gap: float) -> bool:
-    if one.curve != other.curve or abs(other.start - one.end) > 2.0 * gap:
+    """Whether a loop leaves the curve of two runs little between them, and for a short way.
+
+    Around the end of a narrow strip it comes back along the other side of it, near the curve, too.
+    """
+    if one.curve != other.curve or one.sign != other.sign:
         return False
-    # Around the end of a narrow strip the loop comes back along the other side of it, near the curve, too.
-    onward = one.sign == other.sign and (other.start - one.end) * one.sign > -APART
     off = locate(curve, open_part(loop, one.last, other.first))[1]
-    return bool(off.max(initial=0.0) < (gap if onward else gap / 2.0))
+    return bool(-APART < (other.start - one.end) * one.sign < 2.0 * gap and off.max(initial=0.0) < gap)
 
 
 def open_part(loop: Array, first: int, last: int) -> Array:

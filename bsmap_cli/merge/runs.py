@@ -153,18 +153,20 @@ def find_meetings(
         reach = np.linalg.norm(ends - point, axis=1).max() + gap / 2.0
         away = np.linalg.norm(open_part(loop, one.last, other.first) - point, axis=1).max()
         if away < reach and all(
-            _comes_to(point, end, curves[number], others[number], gap)
-            for number, end in ((one.curve, one.end), (other.curve, other.start))
+            _comes_to(point, end, start, curves[number], others[number], gap)
+            for number, end, start in ((one.curve, one.end, one.start), (other.curve, other.start, other.end))
         ):
             out.append(Meeting(k, following, faces, point[0]))
     return out
 
 
-def _comes_to(point: Array, end: float, curve: Curve, other: Array, gap: float) -> bool:
+def _comes_to(point: Array, end: float, start: float, curve: Curve, other: Array, gap: float) -> bool:
     """Whether a corner (1, 3) lies on the curve of a run, and what lies between is short or the other face is there.
 
-    end : where along the curve the run begins or ends.
+    end, start : where along the curve the run ends on the corner's side, and on the other one.
     """
     t, off = (float(value[0]) for value in locate(curve, point))
+    if off >= OFF or abs(t - end) > abs(t - start):
+        return False
     low, high = sorted((t, end))
-    return off < OFF and high - low < (KNOWN if covered(other, low, high, gap) else 2.0 * gap)
+    return high - low < (KNOWN if covered(other, low, high, gap) else 2.0 * gap)

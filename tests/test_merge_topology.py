@@ -221,6 +221,25 @@ def test_notch_of_one_scan_at_a_crease_is_closed(depths, creases):
     assert whole_mesh(result).is_watertight == (creases == 12)
 
 
+def receding(surface, depth):
+    """The plate, along half of its side v = 0 receding by `depth` metres, in steps that scans leave."""
+    at = np.linspace(1.0, 3.5, 26)
+    back = depth * np.where(np.arange(26) % 2, 1.0, 0.7)
+    more = [(u, v, False) for u, v in zip(at, back, strict=True)]
+    return below(surface, (1.0, 0.0, False), *more, (3.5, 0.0, True))
+
+
+@pytest.mark.parametrize(("depth", "both", "closed"), [(0.08, False, True), (0.08, True, False), (0.15, False, False)])
+def test_face_that_ends_just_before_a_crease_is_led_up_to_it_where_the_other_face_ends_in_it(depth, both, closed):
+    whole = boxed("a", LOW, HIGH)
+    names = {"a/floor", "a/south"} if both else {"a/floor"}
+    faces = tuple(receding(s, depth) if s.name in names else s for s in whole.surfaces)
+    result = merged(replace(whole, surfaces=faces))
+    check_creases(result)
+    assert len(result.creases) == (12 if closed else 13)
+    assert whole_mesh(result).is_watertight == closed
+
+
 @pytest.mark.parametrize("high", [0.015, 0.025, 0.06])
 def test_narrow_strip_of_a_wall_below_a_cabinet_keeps_its_crease_and_its_area(high):
     whole = boxed("a", LOW, HIGH, ("floor", "south"))

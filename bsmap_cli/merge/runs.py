@@ -1,6 +1,7 @@
 """Runs of the outlines of faces along the curves in which they meet others, and the corners between two runs."""
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -39,15 +40,25 @@ class Meeting(NamedTuple):
     point: Array
 
 
-def find_runs(loop: Array, curves: Mapping[int, Curve], gap: float) -> list[Run]:
+class Known(NamedTuple):
+    """Which way a loop runs along a curve (+1, -1), and where, lengths (k, 2), the other face's outline does."""
+
+    sign: int
+    others: Array
+
+
+def find_runs(
+    loop: Array, curves: Mapping[int, Curve], gap: float, known: Mapping[int, Known] = MappingProxyType({})
+) -> list[Run]:
     """Runs of a loop (k, 3) in its order.
 
     Parameters
     ----------
     curves : those of its face under their numbers.
     gap : metres; a loop that leaves a curve by less than that, for less than twice of it, runs on along it.
+    known : of curves along which it runs. Where the other face ends in the curve, sides up to `gap` off run along it.
     """
-    along = _curves_of_sides(loop, curves, gap)
+    along = _curves_of_sides(loop, curves, gap, known)
     starts = np.flatnonzero(along != np.roll(along, 1))
     runs = []
     for start, stop in zip(starts.tolist(), np.roll(starts, -1).tolist(), strict=True):
@@ -82,7 +93,7 @@ def _long(runs: Sequence[Run]) -> list[Run]:
     return [run for run in runs if abs(run.end - run.start) > APART]
 
 
-def _curves_of_sides(loop: Array, curves: Mapping[int, Curve], gap: float) -> IntArray:
+def _curves_of_sides(loop: Array, curves: Mapping[int, Curve], gap: float, known: Mapping[int, Known]) -> IntArray:
     """Of each side (k,) the nearest curve that it runs along, -1 for none."""
     length = np.linalg.norm(np.roll(loop, -1, axis=0) - loop, axis=1)
     best, number = np.full(len(loop), np.inf), np.full(len(loop), -1)
@@ -92,8 +103,13 @@ def _curves_of_sides(loop: Array, curves: Mapping[int, Curve], gap: float) -> In
         low, high = t.min(axis=0)[:, None], t.max(axis=0)[:, None]
         seen = np.any((curve.seen[:, 0] < high + gap) & (curve.seen[:, 1] > low - gap), axis=1)
         way = np.abs(t[1] - t[0])
+        near = off < curve.beside
+        if k in known:
+            sign, others = known[k]
+            there = np.any((others[:, 0] <= low + APART) & (others[:, 1] >= high - APART), axis=1)
+            near |= (off < gap) & there & ((t[1] - t[0]) * sign > 0.0)
         # Around a pillar a side leads from the end of the curve to its beginning: it is far shorter than the way back.
-        along = (off < curve.beside) & (off < best) & (way > 0.5 * length) & (way < 2.0 * length) & seen
+        along = near & (off < best) & (way > 0.5 * length) & (way < 2.0 * length) & seen
         best[along], number[along] = off[along], k
     return number
 

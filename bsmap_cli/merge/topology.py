@@ -6,7 +6,7 @@ from the creases and from what is open. A crease that ends inside another one di
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from itertools import combinations
 from typing import NamedTuple
 
@@ -15,14 +15,15 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from bsmap_cli.merge.curves import Curve, FacePair, Shapes, between, locate, onto, place, touched
+from bsmap_cli.merge.curves import APART, Curve, FacePair, Shapes, between, locate, onto, place, touched, union
 from bsmap_cli.merge.rings import Knots, Loop, Ring, knots_of_run, put_together
-from bsmap_cli.merge.runs import OFF, find_meetings, find_runs
+from bsmap_cli.merge.runs import OFF, Known, Run, find_meetings, find_runs
 from bsmap_cli.merge.tracing import curves_of, unseen_curve
 from bsmap_cli.model import Array, IntArray
 
 SAME = 0.01
 """Metres between two corners, or two ends of runs, that are one."""
+NOWHERE = np.zeros((0, 2))
 
 
 class Edge(NamedTuple):
@@ -103,22 +104,46 @@ def _find_loops(
     outlines: Mapping[int, Sequence[Array]], curves: Sequence[Curve], shapes: Shapes, gap: float
 ) -> list[Loop]:
     """All loops with their runs and where these meet."""
-    found, spans = [], defaultdict(list)
-    for face in sorted(outlines):
-        mine = {k: curve for k, curve in enumerate(curves) if face in curve.pair}
-        wide = [points for points in outlines[face] if not _is_sliver(points, mine.values())]
-        for points in wide or outlines[face]:
-            runs = find_runs(points, mine, gap)
-            found.append((face, points, runs, mine))
-            for run in runs:
-                spans[face, run.curve].append(sorted((run.start, run.end)))
-    loops = []
-    for face, points, runs, mine in found:
-        others = {k: np.array(spans[sum(curve.pair) - face, k]).reshape(-1, 2) for k, curve in mine.items()}
-        runs = [r for r in runs if touched(others[r.curve], min(r.start, r.end), max(r.start, r.end), gap)]
-        meetings = find_meetings(points, runs, mine, others, shapes, gap)
-        loops.append(Loop(face, points, runs, meetings, np.full((len(runs), 2), -1)))
-    return loops
+    of_face = {face: {k: curve for k, curve in enumerate(curves) if face in curve.pair} for face in sorted(outlines)}
+    loops = [
+        Loop(face, points, find_runs(points, mine, gap), [], np.full((0, 2), -1))
+        for face, mine in of_face.items()
+        for points in _not_slivers(outlines[face], mine.values())
+    ]
+    others = _others(loops, curves)
+    loops = [loop._replace(runs=_runs_beside(loop, of_face[loop.face], others, gap)) for loop in loops]
+    others = _others(loops, curves)
+    out = []
+    for face, points, runs, *_ in loops:
+        mine = of_face[face]
+        there = {k: others[face, k] for k in mine}
+        runs = [r for r in runs if touched(there[r.curve], min(r.start, r.end), max(r.start, r.end), gap)]
+        meetings = find_meetings(points, runs, mine, there, shapes, gap)
+        out.append(Loop(face, points, runs, meetings, np.full((len(runs), 2), -1)))
+    return out
+
+
+def _others(loops: Sequence[Loop], curves: Sequence[Curve]) -> dict[tuple[int, int], Array]:
+    """By face and curve the lengths (k, 2) along the curve between which the other face runs along it."""
+    spans = defaultdict(list)
+    for loop in loops:
+        for run in loop.runs:
+            spans[sum(curves[run.curve].pair) - loop.face, run.curve].append(sorted((run.start, run.end)))
+    return defaultdict(lambda: NOWHERE, {key: union(np.array(some), APART) for key, some in spans.items()})
+
+
+def _runs_beside(
+    loop: Loop, mine: Mapping[int, Curve], others: Mapping[tuple[int, int], Array], gap: float
+) -> list[Run]:
+    """Runs of a loop, longer where the other face runs along the curve, too."""
+    longest = sorted(loop.runs, key=lambda run: abs(run.end - run.start))
+    known = {run.curve: Known(run.sign, others[loop.face, run.curve]) for run in longest}
+    return find_runs(loop.points, mine, gap, known) if known else loop.runs
+
+
+def _not_slivers(loops: Sequence[Array], curves: Collection[Curve]) -> Sequence[Array]:
+    """The loops of a face but those that are remnants along curves; all where there is nothing else."""
+    return [points for points in loops if not _is_sliver(points, curves)] or loops
 
 
 def _is_sliver(loop: Array, curves: Iterable[Curve]) -> bool:

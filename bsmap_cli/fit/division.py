@@ -30,7 +30,7 @@ from bsmap_cli.fit.lowmodels import CylinderFrame, fit_cylinder_frame, fit_plane
 from bsmap_cli.fit.pieces import find_pieces
 from bsmap_cli.fit.regions import find_regions
 from bsmap_cli.fit.seeds import PAIR_BEAMS
-from bsmap_cli.fit.selection import Fitted, fit_heights, refit
+from bsmap_cli.fit.selection import LEAST_BLOCKS, Fitted, fit_heights, refit
 from bsmap_cli.fit.unions import low_order_cost
 from bsmap_cli.model import Array, IntArray
 
@@ -99,7 +99,8 @@ def find_faces(grid: BeamGrid) -> Faces:
     fitted = [fitted[k] for k in kept]
     fitted = _widened(grid, labels, fitted, sigma)
     for number, one in enumerate(fitted):
-        if _stands_on_edge(one.field, grid.points[(labels == number) & grid.hit]):
+        points = grid.points[(labels == number) & grid.hit]
+        if len(points) < LEAST_BLOCKS * one.field.knots.size or _stands_on_edge(one.field, points):
             labels[labels == number] = -1
     labels, kept = _kept(labels, grid)
     return Faces(labels, [fitted[k] for k in kept], sigma)

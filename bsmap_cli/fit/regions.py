@@ -12,6 +12,7 @@ from collections import deque
 import numpy as np
 
 from bsmap_cli.fit.beams import BeamGrid
+from bsmap_cli.fit.claims import claim, directions_of
 from bsmap_cli.fit.context import PRICE, Context, make_context
 from bsmap_cli.fit.grazing import GRAZED, STEEPER
 from bsmap_cli.fit.lowmodels import (
@@ -46,7 +47,8 @@ def find_regions(grid: BeamGrid, pieces: Pieces) -> tuple[list[list[int]], float
             grown = _grow(context, owner, seed, frame)
             owner[grown] = len(regions)
             regions.append(grown)
-    for pair in pairs(context, owner):
+    regions = claim(context, regions, owner)
+    for pair in pairs(context, owner, directions_of(context, regions)):
         owner[pair] = len(regions)
         regions.append(pair)
     return unite_regions(context, without_grazed_scans(context, regions, owner)), context.sigma

@@ -24,6 +24,10 @@ NEXT = ((-1, 0), (1, 0), (0, -2), (0, -1), (0, 1), (0, 2))
 CHUNK = 20_000
 """Beams whose neighbourhoods are added up at a time."""
 PASSES = 30
+GAP = 3
+"""Beams of the rest that may lie at a border."""
+SHORT = 3
+"""Beams of a run that may be other faces' beams gone astray."""
 REACH = 12
 """Beams by which a border may move at once."""
 
@@ -256,15 +260,39 @@ class _Borders(NamedTuple):
 
 def _borders(labels: IntArray) -> _Borders:
     row, start, stop, label = runs_of(labels)
-    near = (row[1:] == row[:-1]) & (start[1:] - stop[:-1] <= 3) & (label[1:] != label[:-1])
+    near = (row[1:] == row[:-1]) & (start[1:] - stop[:-1] <= GAP) & (label[1:] != label[:-1])
     k = np.flatnonzero(near)
     return _Borders(row[k], stop[k] - 1, start[k + 1], label[k], label[k + 1], k % 2 == 1)
 
 
+def _untangled(grid: BeamGrid, labels: IntArray, table: Table, sigma: float) -> IntArray:
+    """Labels without the runs of a few beams between two of one other face that explains them as well.
+
+    Beside a crease, beams that were left out may have come back to the wrong face; there is one border then, not three.
+    """
+    labels = labels.copy()
+    # First those between long ones of their surroundings, then those that were these surroundings.
+    for shortest in range(1, SHORT + 1):
+        row, start, stop, label = runs_of(labels)
+        near = (row[1:] == row[:-1]) & (start[1:] - stop[:-1] <= GAP)
+        k = 1 + np.flatnonzero(near[:-1] & near[1:] & (label[2:] == label[:-2]) & (label[1:-1] != label[:-2]))
+        k = k[stop[k] - start[k] == shortest]
+        other = label[k - 1]
+        at = start[k, None] + np.arange(shortest)
+        hit = grid.hit[row[k, None], at]
+        of, i = np.nonzero(hit)
+        met = met_at(grid, table, other[of], row[k[of]], at[of, i])
+        good = np.ones(len(k), dtype=bool)
+        good[of[np.abs(met.beyond) > OUTLIER * sigma]] = False
+        labels[row[k[good], None], at[good]] = other[good, None]
+    return labels
+
+
 def move_breaks(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], sigma: float) -> IntArray:
     """Move borders to where the two surfaces give the same range; where they do not meet, to where they fit best."""
-    borders, table = _borders(labels), tabulate(fields)
-    labels = labels.copy()
+    table = tabulate(fields)
+    labels = _untangled(grid, labels, table, sigma)
+    borders = _borders(labels)
     # Successive borders may want the same beams: every second one moves first.
     for second in (False, True):
         _move(grid, labels, table, _Borders(*(of[borders.second == second] for of in borders)), sigma)

@@ -1,0 +1,53 @@
+"""Beams at creases, each on the face that it meets there."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from bsmap_cli.fit.beams import BeamGrid
+from bsmap_cli.fit.feet import tabulate
+from bsmap_cli.fit.heights import HeightField
+from bsmap_cli.fit.labels import GAP, OUTLIER, Runs, fill, met_at, runs_of
+from bsmap_cli.model import IntArray
+
+BEYOND = 4
+"""Beams at the end of a run that may lie beyond its crease."""
+
+
+def on_their_sides(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], sigma: float) -> IntArray:
+    """Labels, the last beams of runs before another face given to that one where they lie beyond the crease.
+
+    Which of two surfaces is nearer along a beam, the noise does not touch: on the other side of their crease it is the
+    other one. Beams that neither side explains go to the rest.
+    """
+    table, labels = tabulate(fields), labels.copy()
+    (row, start, stop, label), near = _joined(runs_of(labels))
+    for own, other, step in ((near, near + 1, -1), (near + 1, near, 1)):
+        first = stop[own] - 1 if step < 0 else start[own]
+        half = np.minimum((stop[own] - start[own]) // 2, 2 * BEYOND)
+        # The last one, inside the run, tells which surface is nearer there.
+        at = first[:, None] + step * np.append(np.broadcast_to(np.arange(BEYOND), (len(own), BEYOND)), half[:, None], 1)
+        r = np.broadcast_to(row[own, None], at.shape)
+        k, i = np.nonzero((np.arange(BEYOND + 1) < half[:, None]) | (np.arange(BEYOND + 1) == BEYOND))
+        seen = grid.hit[r[k, i], at[k, i]]
+        k, i = k[seen], i[seen]
+        to_own, to_other = np.full((2, *at.shape), np.nan)
+        for way, face in ((to_own, label[own]), (to_other, label[other])):
+            way[k, i] = met_at(grid, table, face[k], r[k, i], at[k, i]).beyond
+        sign = np.sign(to_own - to_other)
+        # From the end of the run on as far as beams of the rest allow.
+        wrong = np.logical_and.accumulate((sign[:, :-1] * sign[:, -1:] < 0.0) | np.isnan(sign[:, :-1]), axis=1)
+        wrong &= labels[r[:, :-1], at[:, :-1]] == label[own, None]
+        k, i = np.nonzero(wrong)
+        new = np.where(np.abs(to_other[k, i]) < OUTLIER * sigma, label[other[k]], -1)
+        labels[r[k, i], at[k, i]] = new
+    return fill(grid, labels)
+
+
+def _joined(runs: Runs) -> tuple[Runs, IntArray]:
+    """Runs, those of one face between which only a few beams are as one; and which have another one behind them."""
+    row, start, stop, label = runs
+    near = (row[1:] == row[:-1]) & (start[1:] - stop[:-1] <= GAP)
+    same = near & (label[1:] == label[:-1])
+    first, last = np.flatnonzero(np.append(True, ~same)), np.flatnonzero(np.append(~same, True))
+    return Runs(row[first], start[first], stop[last], label[first]), np.flatnonzero(near[last[:-1]])

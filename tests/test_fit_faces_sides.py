@@ -1,0 +1,80 @@
+"""Beams beside creases belong to the face that they meet there."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from face_scenes import corridor_set
+
+from bsmap_cli.evaluate import distance_to_mesh
+from bsmap_cli.fit.beams import make_grid
+from bsmap_cli.fit.division import find_faces
+from bsmap_cli.fit.labels import feet_of_faces, move_breaks
+from bsmap_cli.fit.sides import on_their_sides
+
+
+@pytest.fixture(scope="module")
+def corridor():
+    """Grid, labels, fields and noise of the corridor at 10 mm."""
+    grid = make_grid(corridor_set().cloud, np.arange(20))
+    faces = find_faces(grid)
+    return grid, faces.labels, [fitted.field for fitted in faces.fitted], faces.sigma
+
+
+def border(labels, scan):
+    """Beam behind the last one of the longest run that a run of another face follows at once."""
+    change = np.flatnonzero(
+        (labels[scan, 1:] != labels[scan, :-1]) & (labels[scan, 1:] >= 0) & (labels[scan, :-1] >= 0)
+    )
+    return int(change[0]) + 1
+
+
+def test_beams_beyond_a_crease_go_back(corridor):
+    grid, labels, fields, sigma = corridor
+    moved = labels.copy()
+    for scan in range(20):
+        at = border(labels, scan)
+        step = 2 if scan % 2 else -2
+        first, last = sorted((at, at + step))
+        moved[scan, first:last] = labels[scan, at if step < 0 else at - 1]
+    assert np.count_nonzero(moved != labels) == 40
+    found = on_their_sides(grid, moved, fields, sigma)
+    assert np.count_nonzero(found != labels) == 0
+
+
+def test_what_lies_on_its_side_stays(corridor):
+    grid, labels, fields, sigma = corridor
+    np.testing.assert_array_equal(on_their_sides(grid, labels, fields, sigma), labels)
+
+
+def test_a_beam_that_neither_side_explains_is_left(corridor):
+    grid, labels, fields, sigma = corridor
+    at = border(labels, 4)
+    moved = labels.copy()
+    moved[4, at] = labels[4, at - 1]
+    points = grid.points.copy()
+    points[4, at] += 0.5 * grid.directions[4, at]
+    assert on_their_sides(replace(grid, points=points), moved, fields, sigma)[4, at] == -1
+
+
+def test_a_tangle_of_beams_beside_a_crease_becomes_one_border(corridor):
+    grid, labels, fields, sigma = corridor
+    tangled = labels.copy()
+    for scan in range(20):
+        at = border(labels, scan)
+        a, b = labels[scan, [at - 1, at]]
+        tangled[scan, at - 4 : at + 4] = [a, b, b, a, a, b, a, b]
+    found = move_breaks(grid, tangled, fields, sigma)
+    assert np.mean(found == labels) > 0.999
+    for scan in range(20):
+        at = border(labels, scan)
+        assert np.count_nonzero(np.diff(found[scan, at - 6 : at + 6])) == 1
+
+
+def test_largest_error_at_30_mm_noise_is_that_of_the_noise():
+    place = corridor_set(0.03, 8)
+    grid = make_grid(place.cloud, np.arange(20))
+    faces = find_faces(grid)
+    feet = feet_of_faces(grid, faces.labels, [fitted.field for fitted in faces.fitted])
+    points = np.concatenate([of.points for of in feet])
+    assert distance_to_mesh(points, place.vertices, place.triangles).max() < 0.03

@@ -85,7 +85,7 @@ def make_target(points: OrientedPoints) -> Target:
     lines = np.zeros((len(points.xy) + 1, 3))
     lines[:-1, :2] = points.normal
     lines[:-1, 2] = np.einsum("ij,ij->i", points.xy, points.normal)
-    return Target(points, cKDTree(points.xy, balanced_tree=False, compact_nodes=False), lines)
+    return Target(points, cKDTree(points.xy, leafsize=32, balanced_tree=False, compact_nodes=False), lines)
 
 
 def nearest_points(target: Target, xy: Array, reach: float) -> tuple[Array, IntArray]:

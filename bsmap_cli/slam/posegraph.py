@@ -134,11 +134,12 @@ def term_matrix(term: Term, size: int) -> sparse.csc_matrix:
     return sparse.csc_matrix((np.concatenate(values), (rows, columns)), shape=(size, size))
 
 
-def entries(rows: IntArray, columns: IntArray, blocks: Array) -> tuple[IntArray, IntArray]:
+def entries(rows: IntArray, columns: IntArray, blocks: Array) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Row and column of each entry of blocks (k, a, b) that begin at `rows` and `columns` (k,)."""
     a, b = blocks.shape[1:]
-    row = np.broadcast_to(rows[:, None, None] + np.arange(a)[:, None], blocks.shape)
-    column = np.broadcast_to(columns[:, None, None] + np.arange(b), blocks.shape)
+    # Whole numbers as scipy has them, which else copies them.
+    row = rows.astype(np.int32)[:, None] + np.repeat(np.arange(a, dtype=np.int32), b)
+    column = columns.astype(np.int32)[:, None] + np.tile(np.arange(b, dtype=np.int32), a)
     return row.ravel(), column.ravel()
 
 

@@ -83,13 +83,16 @@ def _beside(
     """
     pose, seen = poses[segments.scan[rows]], segments.parameters[rows]
     in_map = extents_of(pose, seen, segments.extents[rows])
-    turn = se2.wrap(seen[:, None, 0] + pose[:, None, 2] - lines[None, :, 0])
-    overlap = np.minimum(in_map[:, None, 1], extents[None, :, 1]) - np.maximum(in_map[:, None, 0], extents[None, :, 0])
-    a, b = np.nonzero((np.abs(turn) < MOST_TURN) & (overlap > -margin))
+    turn = se2.wrap((seen[:, 0] + pose[:, 2])[:, None] - lines[:, 0])
+    a, b = np.nonzero(np.abs(turn) < MOST_TURN)
+    overlap = np.minimum(in_map[a, 1], extents[b, 1]) - np.maximum(in_map[a, 0], extents[b, 0])
+    beside = overlap > -margin
+    a, b = a[beside], b[beside]
+    turn = turn[a, b]
     alpha = lines[b, 0]
     r = lines[b, 1] - pose[a, 0] * np.cos(alpha) - pose[a, 1] * np.sin(alpha)
     middle = segments.extents[rows[a]].mean(axis=1)
-    return a, b, turn[a, b], seen[a, 1] - r - turn[a, b] * middle
+    return a, b, turn, seen[a, 1] - r - turn * middle
 
 
 def with_rivals(

@@ -59,8 +59,9 @@ def _pose(x: Array, y: Array, theta: Array) -> Array:
 
 def compose_jacobians(a: Array, b: Array) -> tuple[Array, Array]:
     """Derivatives (3, 3) of compose(a, b) by a and by b (Smith, Self, Cheeseman 1990)."""
-    c, s = np.cos(a[2]), np.sin(a[2])
-    by_a = np.array([[1.0, 0.0, -s * b[0] - c * b[1]], [0.0, 1.0, c * b[0] - s * b[1]], [0.0, 0.0, 1.0]])
+    c, s = math.cos(a[2]), math.sin(a[2])
+    x, y, _ = b.tolist()
+    by_a = np.array([[1.0, 0.0, -s * x - c * y], [0.0, 1.0, c * x - s * y], [0.0, 0.0, 1.0]])
     by_b = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     return by_a, by_b
 

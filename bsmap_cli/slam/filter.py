@@ -110,8 +110,9 @@ def line_jacobians(pose: Array, alpha: Array) -> tuple[Array, Array]:
     by_pose, by_line = np.zeros((*c.shape, 2, 3)), np.zeros((*c.shape, 2, 2))
     by_pose[..., 0, 2] = -1.0
     by_pose[..., 1, 0], by_pose[..., 1, 1] = -c, -s
+    x, y, _ = pose.tolist()
     by_line[..., 0, 0] = by_line[..., 1, 1] = 1.0
-    by_line[..., 1, 0] = pose[0] * s - pose[1] * c
+    by_line[..., 1, 0] = x * s - y * c
     return by_pose, by_line
 
 

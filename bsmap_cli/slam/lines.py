@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bsmap_cli.core import se2
+from bsmap_cli.core.table import take
 from bsmap_cli.model import Array, IntArray, LineMap
 from bsmap_cli.params import SlamParams
 from bsmap_cli.slam import filter
@@ -34,6 +35,7 @@ def map_lines(poses: Array, segments: Segments, params: SlamParams) -> MappedLin
     n = len(poses)
     counts, nis = np.zeros((n, 3), int), np.zeros(n)
     state, landmarks, shelf = filter.initial_state(poses[0]), no_landmarks(), empty_shelf()
+    border = np.searchsorted(segments.scan, np.arange(n + 1)).tolist()
     step_noise, anchor = np.diag(STEP_SPREAD) ** 2, np.diag(ANCHOR_SPREAD) ** 2
     for k in range(n):
         if k > 0:
@@ -41,7 +43,7 @@ def map_lines(poses: Array, segments: Segments, params: SlamParams) -> MappedLin
             state = filter.update_pose(state, poses[k], anchor)
         if k % EVERY == 0:
             state, landmarks, shelf = look_around(state, landmarks, shelf, k)
-        seen = segments.of_scan(k)
+        seen = take(segments, slice(border[k], border[k + 1]))
         state, landmarks, matched, nis[k] = line_step(state, landmarks, seen, k, params)
         counts[k] = len(seen.scan), len(landmarks.hits) + len(shelf.lines), matched
     whole = put(Shelf(state.lines, filter.line_covariances(state), landmarks), shelf)

@@ -3,10 +3,12 @@
 Censi (2008) for the metric, with a Cauchy loss whose width shrinks from the reach of the search to the noise.
 """
 
+import cmath
 import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bsmap_cli.model import Array, IntArray
@@ -22,6 +24,8 @@ SEARCH_STEP, SEARCH_STEPS, SEARCH_ANGLE, SEARCH_CELLS = 0.3, 8, 0.12, 6
 a step within which all points have the same nearest one."""
 LEAST_REACH = 0.15
 """Metres within which points pair in the end."""
+_FACTORS = np.array([[1.0, 0, 0, 0, 0, 0], [0, 1.0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0], [0, 0, 0, 0, -1.0, 0]])
+"""Of the terms of a pair in the derivatives of its error and in the error, where the pose does not change them."""
 SAME_WAY = 0.7
 """Cosine of the angle between normals above which two points can be of one surface."""
 
@@ -60,12 +64,13 @@ def _row_rotation(theta: float) -> Array:
 class Target(NamedTuple):
     """Map to match against: its points, a spatial index of them, and their lines.
 
-    lines : (n + 1, 3), normal and offset of each; the last one, 0, stands for no point.
+    normals : (n + 1,) of the lines, as complex numbers; the last one, 0, stands for no point.  offsets : (n + 1,).
     """
 
     points: OrientedPoints
     tree: cKDTree
-    lines: Array
+    normals: NDArray[np.complex128]
+    offsets: Array
 
 
 class Match(NamedTuple):
@@ -82,10 +87,16 @@ class Match(NamedTuple):
 
 def make_target(points: OrientedPoints) -> Target:
     """Target of points given in one frame."""
-    lines = np.zeros((len(points.xy) + 1, 3))
-    lines[:-1, :2] = points.normal
-    lines[:-1, 2] = np.einsum("ij,ij->i", points.xy, points.normal)
-    return Target(points, cKDTree(points.xy, leafsize=32, balanced_tree=False, compact_nodes=False), lines)
+    normals, offsets = np.zeros(len(points.xy) + 1, np.complex128), np.zeros(len(points.xy) + 1)
+    normals[:-1] = as_complex(points.normal)
+    offsets[:-1] = np.einsum("ij,ij->i", points.xy, points.normal)
+    tree = cKDTree(points.xy, leafsize=32, balanced_tree=False, compact_nodes=False)
+    return Target(points, tree, normals, offsets)
+
+
+def as_complex(vectors: Array) -> NDArray[np.complex128]:
+    """Vectors (n, 2) as complex numbers (n,): turning them is a product, and takes one call."""
+    return vectors.view(np.complex128)[:, 0]
 
 
 def nearest_points(target: Target, xy: Array, reach: float) -> tuple[Array, IntArray]:
@@ -139,7 +150,7 @@ def _normals(half_difference: Array, xy: Array, spread: Array) -> Array:
 class _Pairs(NamedTuple):
     """Points paired from one pose, the closer ones within `reach` metres.
 
-    terms : (k, 5) of each pair's error, see `_moments`.  distance : (k,) metres between the two.
+    terms : (k, 6) of each pair's error, see `_moments`.  distance : (k,) metres between the two.
     """
 
     pose: Floats
@@ -194,12 +205,14 @@ def _moments(pairs: _Pairs, pose: Floats, width: float, sigma: float) -> tuple[A
     """(4, 4) weighted sums of products of the derivatives by x, y, theta and of the errors; the errors (k,), metres.
 
     A point p of the source errs from the line with normal n and offset r by n . (R p + t) - r, which is linear in the
-    five terms n, n . p, n x p and r with factors that the pose alone gives. Weights of the Cauchy loss, `width` metres
-    wide, over sigma squared.
+    terms n, n . p, n x p and r (and 0 at the end) with factors that the pose alone gives. Weights of the Cauchy loss,
+    `width` metres wide, over sigma squared.
     """
     x, y, theta = pose
     c, s = math.cos(theta), math.sin(theta)
-    factors = np.array([[1.0, 0, 0, 0, 0], [0, 1.0, 0, 0, 0], [0, 0, -s, -c, 0], [x, y, c, -s, -1.0]])
+    factors = _FACTORS.copy()
+    factors[2, 2:4] = -s, -c
+    factors[3, :4] = x, y, c, -s
     A = factors @ pairs.terms.T
     spread = A[3] * (sigma / width)
     spread *= spread
@@ -233,16 +246,20 @@ def _has_moved(before: Floats, pose: Floats) -> bool:
 
 def _pair(source: OrientedPoints, target: Target, pose: Floats, reach: float) -> _Pairs:
     """Each point of the source, at the pose, with the nearest of the target that faces its way."""
-    R = _row_rotation(pose[2])
-    distance, nearest = nearest_points(target, source.xy @ R + pose[:2], reach)
-    lines, facing = target.lines[nearest], source.normal @ R
-    same = np.flatnonzero(lines[:, 0] * facing[:, 0] + lines[:, 1] * facing[:, 1] > SAME_WAY)
-    lines, xy = lines[same], source.xy[same]
-    terms = np.empty((len(same), 5))
-    terms[:, :2], terms[:, 4] = lines[:, :2], lines[:, 2]
-    nx, ny, x, y = lines[:, 0], lines[:, 1], xy[:, 0], xy[:, 1]
-    terms[:, 2], terms[:, 3] = nx * x + ny * y, nx * y - ny * x
-    return _Pairs(pose, reach, terms, distance[same])
+    x, y, theta = pose
+    turn = cmath.rect(1.0, theta)
+    points = as_complex(source.xy)
+    placed = points * turn
+    placed += complex(x, y)
+    distance, nearest = nearest_points(target, placed.view(np.float64).reshape(-1, 2), reach)
+    normals = target.normals[nearest].conj()
+    same = np.flatnonzero((normals * (as_complex(source.normal) * turn)).real > SAME_WAY)
+    terms = np.empty((len(same), 3), np.complex128)
+    normals = normals[same]
+    terms[:, 0] = normals.conj()
+    np.multiply(normals, points[same], out=terms[:, 1])
+    terms[:, 2] = target.offsets[nearest[same]]
+    return _Pairs(pose, reach, terms.view(np.float64), distance[same])
 
 
 def search(
@@ -287,7 +304,8 @@ def _scores(target: Target, xy: Array, normal: Array, shifts: IntArray, step: fl
     distance, nearest = nearest_points(target, centres, 3 * sigma)
     score = np.exp(-0.5 * (distance / sigma) ** 2)
     which = number[index]
-    nx, ny = target.lines[nearest, 0][which], target.lines[nearest, 1][which]
+    normals = target.normals[nearest]
+    nx, ny = normals.real[which], normals.imag[which]
     facing = nx * normal[:, None, :, 0] + ny * normal[:, None, :, 1] > SAME_WAY
     return np.asarray((score[which] * facing).mean(axis=-1))
 

@@ -78,10 +78,11 @@ def line_step(state: FilterState, landmarks: Landmarks, segments: Segments, step
     first_new = len(landmarks.hits)
     for new in unknown:
         state = filter.augment(state, segments.parameters[new], segments.covariances[new])
-    seen = extents_in_map(state.pose, segments.parameters[unknown], segments.extents[unknown])
-    landmarks = append(landmarks, seen, step)
+    if len(unknown):
+        seen = extents_in_map(state.pose, segments.parameters[unknown], segments.extents[unknown])
+        landmarks = append(landmarks, seen, step)
     touched = sorted({*line.tolist(), *range(first_new, len(landmarks.hits))})
-    same = np.diag([params.line_angle_floor, params.line_offset_floor]) ** 2
+    same = np.array([[params.line_angle_floor**2, 0.0], [0.0, params.line_offset_floor**2]])
     state, landmarks = join_lines(state, landmarks, touched, params.gate, params.overlap_margin, same)
     state, landmarks = prune(state, landmarks, step, params.tentative_hits, params.tentative_scans)
     return Step(state, landmarks, len(chosen), nis)
@@ -90,7 +91,7 @@ def line_step(state: FilterState, landmarks: Landmarks, segments: Segments, step
 def _bearings(segments: Segments) -> Array:
     """(k,) direction from the robot to the middle of each segment, radians."""
     alpha, r = segments.parameters.T
-    middle = segments.extents.mean(axis=1)
+    middle = (segments.extents[:, 0] + segments.extents[:, 1]) / 2
     return se2.wrap(alpha + np.arctan2(middle, r))
 
 

@@ -49,6 +49,8 @@ def look_around(
     near = distances(state.pose, shelf.lines, shelf.landmarks.extents) < REACH
     far = distances(state.pose, state.lines, landmarks.extents) > REACH
     aside = np.flatnonzero(far & (step - landmarks.last_seen > UNSEEN))
+    if len(aside) == 0 and not near.any():
+        return state, landmarks, shelf
     covariances = filter.line_covariances(state, aside)
     laid = Shelf(state.lines[aside].copy(), covariances, take(landmarks, aside))
     for line in aside[::-1]:

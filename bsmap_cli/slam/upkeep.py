@@ -72,8 +72,6 @@ def follow(landmarks: Landmarks, before: Array, after: Array) -> Landmarks:
 
 def append(landmarks: Landmarks, extents: Array, step: int) -> Landmarks:
     """Landmarks with new lines of extents (k, 2), seen for the first time."""
-    if len(extents) == 0:
-        return landmarks
     ones = np.ones(len(extents), int)
     return Landmarks(
         np.r_[landmarks.extents, extents], np.r_[landmarks.hits, ones], np.r_[landmarks.last_seen, step * ones]

@@ -9,9 +9,10 @@ from bsmap_cli.model import ScanLog
 from bsmap_cli.params import SlamParams
 from bsmap_cli.slam import loops, run_slam
 from bsmap_cli.slam.loops import close_loops
+from bsmap_cli.slam.matching import OrientedPoints, make_target
 from bsmap_cli.slam.posegraph import Edges
 from bsmap_cli.slam.recognition import FEWEST_WITNESSES, witnesses
-from bsmap_cli.slam.submaps import Search
+from bsmap_cli.slam.submaps import Search, register
 from bsmap_cli.slam.tracking import Tracking, track_scans
 from bsmap_cli.track import silent
 
@@ -205,3 +206,39 @@ def test_map_tells_its_loops_by_scans_and_how_it_was_tracked():
     paper = run_slam(log_of(ring(), ROUND[:30], beams=180), SlamParams(method="paper"))
     assert paper.tracked_poses is None
     assert len(paper.closures.first) == 0
+
+
+def corridor_points(doors: bool, seed: int) -> OrientedPoints:
+    """Two walls along x, 2 m apart, their normals off by 0.03 rad; with doors, a few points that face along x too."""
+    rng = np.random.default_rng(seed)
+    x = np.tile(np.arange(-6.0, 6.0, 0.1), 2)
+    side = np.repeat([-1.0, 1.0], len(x) // 2)
+    direction = -np.pi / 2 * side + 0.03 * rng.normal(size=len(x))
+    xy = np.column_stack([x, side]) + SIGMA * rng.normal(size=(len(x), 2)) * [0, 1]
+    if doors:
+        at = np.repeat([-3.0, 1.0, 2.0], 4)
+        frames = np.column_stack([at + SIGMA * rng.normal(size=12), np.tile([1.05, 1.1, 1.15, 1.2], 3)])
+        xy, direction = np.vstack([xy, frames]), np.concatenate([direction, np.zeros(12)])
+    return OrientedPoints(xy, np.column_stack([np.cos(direction), np.sin(direction)]))
+
+
+def test_bare_corridor_tells_nothing_of_the_place_along_it():
+    """Though the normals scatter, and however many of its points match; what crosses the walls is known as before."""
+    along_x = []
+    for seed in range(10):
+        source, target = corridor_points(False, seed), make_target(corridor_points(False, seed + 100))
+        found = register(source, target, np.array([0.5, 0.0, 0.0]), 0.03, 0.0, 0.0)
+        assert found is not None
+        along_x.append(found.information[0, 0])
+        assert found.information[1, 1] > 0.7 * len(source.xy) / 0.03**2
+        assert found.information[2, 2] > 0.7 * (source.xy[:, 0] ** 2).sum() / 0.03**2
+    assert max(along_x) < 1 / 0.1**2
+    assert np.median(along_x) < 1 / 0.5**2
+
+
+def test_doors_tell_the_place_along_a_corridor():
+    source, target = corridor_points(True, 0), make_target(corridor_points(True, 100))
+    found = register(source, target, np.array([0.02, 0.0, 0.0]), 0.03, 0.0, 0.0)
+    assert found is not None
+    assert 1 / 0.03**2 < found.information[0, 0] < 13 / 0.03**2
+    assert found.pose == pytest.approx(0.0, abs=0.01)

@@ -9,7 +9,17 @@ from numpy.typing import NDArray
 from bsmap_cli.core import se2
 from bsmap_cli.core.table import joined, take
 from bsmap_cli.model import Array
-from bsmap_cli.slam.matching import Match, OrientedPoints, Target, make_target, match, search
+from bsmap_cli.slam.matching import (
+    LEAST_REACH,
+    SAME_WAY,
+    Match,
+    OrientedPoints,
+    Target,
+    make_target,
+    match,
+    nearest_points,
+    search,
+)
 from bsmap_cli.slam.posegraph import Edges
 
 AGREEMENT = 0.7
@@ -19,6 +29,8 @@ SOURCE_KEYS, TARGET_KEYS = 5, 10
 SOURCE_POINTS = 150
 CLOSURE_FLOOR = (0.02, 0.02, 0.005)
 """Standard deviations of a closure beside that of the match: metres, metres, radians."""
+WIDTH, CHANCE = 0.05, 2.0
+"""Metres by which a pair of points may be apart at half its weight; standard deviations that chance may add up to."""
 BOLD = (0.5, 0.1)
 """Metres and radians by which poses may differ and still agree."""
 
@@ -75,21 +87,51 @@ def small_map(look: Search, centre: int, keys: Sequence[int], step: int = 1) -> 
 def register(
     source: OrientedPoints, target: Target, guess: Array, noise: float, span: float, turn: float
 ) -> Match | None:
-    """Match of two small maps, from the guess; None where they do not agree.
+    """Match of two small maps, from the guess, with what it knows surely; None where they do not agree.
 
     span, turn : metres and radians about the guess that are searched where the match from there fails; no turn: none.
     """
     loose = np.diag([0.01, 0.01, 0.25])
     found = match(source, target, guess, loose, noise, reach=1.0)
-    if found.inliers >= AGREEMENT:
-        return found
-    if turn == 0.0:
+    if found.inliers < AGREEMENT and turn == 0.0:
         return None
-    for start in search(source, target, guess, span, turn):
+    starts = [] if found.inliers >= AGREEMENT else search(source, target, guess, span, turn)
+    for start in starts:
         coarse = match(source, target, start, loose, noise, max(0.5, span / 6))
         if coarse.inliers > found.inliers:
             found = coarse
-    return found if found.inliers >= AGREEMENT else None
+    if found.inliers < AGREEMENT:
+        return None
+    return found._replace(information=sure_information(source, target, found.pose, noise))
+
+
+def sure_information(source: OrientedPoints, target: Target, pose: Array, noise: float) -> Array:
+    """(3, 3) information of a match at `pose` (3,), in the target's frame, less what noise of the normals feigns.
+
+    The normals of a smooth wall scatter, and the squares of what each has along the wall add up to what looks like
+    knowledge of the place there. Products of the two normals of a pair have the right mean, for their noise is
+    independent; and of a sum of such, what is below twice its standard deviation may be chance.
+    """
+    moved = source.moved(pose)
+    distance, nearest = nearest_points(target, moved.xy, LEAST_REACH)
+    near = np.flatnonzero(np.isfinite(distance))
+    there, here = take(target.points, nearest[near]), take(moved, near)
+    facing = np.flatnonzero(np.einsum("ij,ij->i", there.normal, here.normal) > SAME_WAY)
+    there, here = take(there, facing), take(here, facing)
+    arm = here.xy - pose[:2]
+    error = np.einsum("ij,ij->i", there.normal, here.xy - there.xy) / max(2 * noise, WIDTH)
+    weight = 1.0 / (noise**2 * (1.0 + error**2))
+    lever = max(float(np.sqrt((arm**2).sum() / max(len(arm), 1))), 1e-3)
+    scale = np.array([1.0, 1.0, 1.0 / lever])
+    by_there, by_here = (
+        np.column_stack([n, n[:, 1] * arm[:, 0] - n[:, 0] * arm[:, 1]]) * scale for n in (there.normal, here.normal)
+    )
+    both = (by_there * weight[:, None]).T @ by_here
+    axes = np.linalg.eigh((both + both.T) / 2)[1]
+    parts = weight[:, None] * (by_there @ axes) * (by_here @ axes)
+    known = np.maximum(parts.sum(axis=0) - CHANCE * np.sqrt((parts**2).sum(axis=0)), 0.0)
+    axes = axes / scale[:, None]
+    return np.asarray((axes * known) @ axes.T, dtype=np.float64)
 
 
 def closure_edge(first: int, second: int, found: Match) -> Edges:

@@ -299,15 +299,17 @@ def _scores(target: Target, xy: Array, normal: Array, shifts: IntArray, step: fl
     seen[index] = True
     cells = np.flatnonzero(seen)
     number = np.empty(width * height, np.int32)  # of each cell that was seen
-    number[cells] = np.arange(len(cells))
+    number[cells] = np.arange(len(cells), dtype=np.int32)
     centres = cell * (np.stack(np.divmod(cells, height), axis=1) + low)
     distance, nearest = nearest_points(target, centres, 3 * sigma)
-    score = np.exp(-0.5 * (distance / sigma) ** 2)
+    score = np.exp(-0.5 * (distance / sigma) ** 2).astype(np.float32)
+    normals, own = target.normals[nearest].astype(np.complex64), normal.astype(np.float32)[:, None]
     which = number[index]
-    normals = target.normals[nearest]
-    nx, ny = normals.real[which], normals.imag[which]
-    facing = nx * normal[:, None, :, 0] + ny * normal[:, None, :, 1] > SAME_WAY
-    return np.asarray((score[which] * facing).mean(axis=-1))
+    facing = normals.real[which] * own[..., 0]
+    facing += normals.imag[which] * own[..., 1]
+    worth = score[which]
+    worth *= facing > SAME_WAY
+    return np.asarray(worth.mean(axis=-1))
 
 
 def _centred(reach: float, step: float) -> Array:

@@ -80,6 +80,13 @@ def test_bare_corridor_keeps_the_prior_along_it():
     assert weakest < 1e-6 * found.information[1, 1]
 
 
+@pytest.mark.parametrize("turn", [0.0, 0.3, np.pi / 2])
+def test_single_wall_without_any_prior_moves_nothing_along_it(turn):
+    wall = wall_points(np.array([[[-3, 2], [3, 2]]], float), ORIGIN).moved(np.array([0.0, 0.0, turn]))
+    found = match(wall, make_target(wall), np.zeros(3), np.zeros((3, 3)), SIGMA)
+    np.testing.assert_allclose(found.pose, 0.0, atol=1e-6)
+
+
 def test_prior_holds_against_nothing_and_gives_way_to_many_points(target, points):
     prior = np.diag([1 / 0.05**2, 1 / 0.05**2, 1 / 0.02**2])
     pose = np.array([0.1, 0.0, 0.0])

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bsmap_cli.core.uncertainty import FROM_THREE, is_plane
 from bsmap_cli.errors import BadInputError, MissingInputError
 from bsmap_cli.io.artifact import Provenance, is_up_to_date, read_provenance
 from bsmap_cli.io.surfaces_json import read_surfaces, write_surfaces
@@ -19,6 +20,7 @@ from bsmap_cli.model import (
     BSplineSurface,
     DataSet,
     Decision,
+    HeightCovariance,
     PosePart,
     Residuals,
     SurfaceCovariance,
@@ -26,6 +28,9 @@ from bsmap_cli.model import (
 )
 
 MADE = Provenance("fit", "0.1.0", {"bound_u": 0.01}, (("a.cloud.ply", "0" * 64),), "e" * 56, {"surfaces": 2})
+
+
+ENDS = np.array([0.0, 0.0, 1.0, 1.0])
 
 
 def correlation(rng: np.random.Generator, n: int) -> np.ndarray:
@@ -123,6 +128,26 @@ def test_rounding_of_a_singular_covariance_is_accepted(tmp_path: Path) -> None:
     read_surfaces(tmp_path / "a.json")
 
 
+def test_covariance_of_a_plane_comes_back_as_that_of_a_plane(tmp_path: Path) -> None:
+    """Of four heights that lie in a plane the covariance of three is written: 6 numbers, which are rounded."""
+    rng = np.random.default_rng(7)
+    F = FROM_THREE @ np.tril(rng.normal(size=(3, 3)) * 1e-3 + np.eye(3) * 2e-3)
+    curved = surface(nu=4, nv=4)
+    known = HeightCovariance(np.array([[[0.0, 0.0, 1.0]]]), F @ F.T, curved.covariance.pose)
+    net = curved.control_points[:2, :2]
+    flat = BSplineSurface(curved.name, curved.data_sets, 1, 1, ENDS, ENDS, net, known, curved.residuals)
+    data_sets = surface_map().data_sets[:1]
+    write_surfaces(tmp_path / "a.json", SurfaceMap((flat,), data_sets))
+    plain = json.loads((tmp_path / "a.json").read_text())
+    assert len(plain["surfaces"][0]["covariance"]["root"]) == 6
+    read = read_surfaces(tmp_path / "a.json")
+    matrix = read.surfaces[0].covariance.matrix
+    assert is_plane(matrix)
+    np.testing.assert_allclose(matrix, F @ F.T, rtol=0.0, atol=0.02 * np.diag(F @ F.T).max())
+    write_surfaces(tmp_path / "b.json", read)
+    assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
+
+
 def change(*path: Any, to: Any) -> Callable[[Any], None]:
     """Function that sets a value deep in a JSON object, or removes it where `to` is None."""
 
@@ -141,7 +166,7 @@ S = "surfaces", 0
 WHERE = r"a\.json: surfaces\[0\] \(translation-0\): "
 WRONG = [
     (change("format", to="other"), r"is JSON, but not surfaces of bsmap"),
-    (change("version", to=9), r"is of version 9, this bsmap reads 6"),
+    (change("version", to=9), r"is of version 9, this bsmap reads 7"),
     (change("surfaces", to=None), r"file: surfaces is missing"),
     (change("notes", to=[]), r"file: notes is \[\], wanted an object"),
     (change(*S, to="x"), r"surfaces\[0\]: is 'x', wanted an object"),

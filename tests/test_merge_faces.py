@@ -12,7 +12,7 @@ from scenes import simulated
 from bsmap_cli.cloud import make_cloud
 from bsmap_cli.core.bspline import evaluate_surface
 from bsmap_cli.core.trims import inside_trims
-from bsmap_cli.core.uncertainty import sensor_covariance, surface_covariance
+from bsmap_cli.core.uncertainty import is_plane, sensor_covariance, surface_covariance
 from bsmap_cli.evaluate import distance_to_mesh, surface_samples
 from bsmap_cli.export.tessellation import tessellate
 from bsmap_cli.fit import fit_surfaces
@@ -60,18 +60,28 @@ def test_overlapping_halves_of_a_wall_become_one_plane_with_less_variance():
     assert [d.outcome for d in result.decisions] == ["merged"]
 
 
-def test_fused_heights_are_those_of_generalised_least_squares():
-    """Of the same rectangle twice: c = (A + B)^-1 (A a + B b), and its covariance by the gains."""
+@pytest.mark.parametrize("twist", [0.0, 0.001])
+def test_fused_heights_are_those_of_generalised_least_squares(twist):
+    """Of the same rectangle twice: c = (A + B)^-1 (A a + B b), and its covariance by the gains.
+
+    Where the fourth height does not pay, of all planes the one nearest to that.
+    """
     rng = np.random.default_rng(3)
-    noises = [rng.normal(0.0, SIGMA, (2, 2)) for _ in range(2)]
+    shape = np.array([[1.0, -1.0], [-1.0, 1.0]])
+    noises = [twist * shape + rng.normal(0.0, SIGMA, (2, 2)) for _ in range(2)]
     parts = [wall(f"{name}/1", 0.0, 4.0, noise=n) for name, n in zip("ab", noises, strict=True)]
     (one,) = merged(*parts).surfaces
     # Same covariance both: the mean, and half of it.
     corners = one.control_points.reshape(-1, 3)
-    wanted = np.mean([p.control_points for p in parts], axis=0).reshape(-1, 3)
+    wanted = np.mean([p.control_points for p in parts], axis=0)
+    left = 4.0 if twist else 3.0
+    if not twist:
+        wanted[..., 1] -= shape * np.sum(shape * wanted[..., 1]) / 4.0
+    wanted = wanted.reshape(-1, 3)
     order = [int(np.argmin(np.linalg.norm(corners - w, axis=1))) for w in wanted]
     np.testing.assert_allclose(corners[order], wanted, atol=2e-6)
-    np.testing.assert_allclose(np.diag(one.covariance.matrix), SIGMA**2 / 2, rtol=1e-3)
+    np.testing.assert_allclose(np.diag(one.covariance.matrix), SIGMA**2 / 2 * left / 4.0, rtol=1e-3)
+    assert is_plane(one.covariance.matrix) == (left == 3.0)
 
 
 def test_pose_parts_are_carried_with_shares_that_add_up_to_one():

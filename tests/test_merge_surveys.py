@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from face_maps import SIGMA, floor, map_of, wall
 
-from bsmap_cli.core.uncertainty import surface_covariance
+from bsmap_cli.core.uncertainty import is_plane, surface_covariance
 from bsmap_cli.merge import merge_surfaces
 from bsmap_cli.params import MergeParams
 
@@ -70,6 +70,20 @@ def test_folding_one_by_one_gives_what_joining_all_at_once_gives():
     a, b = wall_of(one_by_one), wall_of(at_once)
     np.testing.assert_allclose(np.diag(a.covariance.matrix), np.diag(b.covariance.matrix), rtol=0.05)
     np.testing.assert_allclose(corners(a), corners(b), atol=1e-4)
+
+
+def test_wall_known_as_a_plane_stays_one_unless_all_surveys_together_tell_otherwise():
+    """A twist that no survey tells alone: eight of them do; and one survey that errs bends no wall that is known."""
+    shape = np.array([[1.0, -1.0], [-1.0, 1.0]])
+    plane = merge_surfaces([map_of(wall("set-01/01", 0.0, 4.0), wall("set-02/01", 0.0, 4.0))], MergeParams())
+    for _ in range(7):
+        plane = merge_surfaces([plane, map_of(wall("set-01/01", 0.0, 4.0))], MergeParams())
+    assert is_plane(wall_of(plane).covariance.matrix)
+    off = 4.0 * SIGMA * shape / 4.0  # a twist of two standard deviations
+    once = merge_surfaces([plane, map_of(wall("set-01/01", 0.0, 4.0, noise=1.5 * off))], MergeParams())
+    assert is_plane(wall_of(once).covariance.matrix)
+    bent = [map_of(wall(f"set-{k:02}/01", 0.0, 4.0, noise=off)) for k in range(8)]
+    assert not is_plane(wall_of(merge_surfaces(bent, MergeParams())).covariance.matrix)
 
 
 def common(surface, modes, trajectory):

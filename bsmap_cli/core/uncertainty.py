@@ -11,6 +11,33 @@ from bsmap_cli.core.gaussian import symmetric_sqrt, unpack
 from bsmap_cli.model import Array, BSplineSurface, HeightCovariance, PosePart, SurfaceCovariance
 
 CHUNK = 2048
+TWIST = np.array([1.0, -1.0, -1.0, 1.0])
+"""Of the four heights of a bilinear patch, row by row, what makes it no plane."""
+FROM_THREE = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 1.0, 1.0]])
+"""The four heights of a plane by the first three."""
+FLAT = 1e-8
+"""Metres of twist below which heights are those of a plane."""
+
+
+def is_plane(covariance: Array) -> bool:
+    """Whether heights with a covariance (n, n) are the four of a bilinear patch that is a plane for certain."""
+    return len(covariance) == 4 and bool(TWIST @ covariance @ TWIST < FLAT**2)
+
+
+def with_twist(covariance: Array) -> Array:
+    """Covariance (4, 4) of the heights of a plane as if they had been fitted without knowing that it is one.
+
+    With s and t from -1 to 1 heights are a + b s + c t + d (s - s0) (t - t0), where a + b s0 + c t0 has the least
+    variance. Of data whose density is a product of one in s and one in t, the variance of d is that of b times that of
+    c over the least one, and d has nothing in common with the others.
+    """
+    s, t = np.array([-1.0, -1.0, 1.0, 1.0]), np.array([-1.0, 1.0, -1.0, 1.0])
+    G = np.stack([np.ones(4), s, t]) / 4.0
+    K = G @ covariance @ G.T
+    middle = -np.linalg.solve(K[1:, 1:], K[1:, 0])
+    least = K[0, 0] + K[0, 1:] @ middle
+    shape = (s - middle[0]) * (t - middle[1])
+    return np.asarray(covariance + K[1, 1] * K[2, 2] / least * np.outer(shape, shape))
 
 
 def pose_covariance(pose: Sequence[PosePart], points: Array) -> Array:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from bsmap_cli.core.bspline import clamped_knots
+from bsmap_cli.core.uncertainty import FROM_THREE
 from bsmap_cli.io.trim_loops import Sheet, sheet_of, unpack_loop
 from bsmap_cli.io.whole_numbers import CURVES, DIRECTIONS, POINTS, POSES, ROOTS, WEIGHTS, from_pose_root, from_whole
 from bsmap_cli.model import (
@@ -186,15 +187,25 @@ def _heights(plain: dict[str, Any], nu: int, nv: int, pose: tuple[PosePart, ...]
         raise MalformedError(f"{where}: directions are not of length 1")
     n = nu * nv
     if "root" in plain:
-        root = np.zeros((n, n))
-        root.T[np.triu_indices(n)] = _array(plain, "root", (n * (n + 1) // 2,), where)
-        root *= _get(plain, "scale", int, where) / ROOTS
+        root = _root(plain, n, where) * _get(plain, "scale", int, where) / ROOTS
         return HeightCovariance(directions, root @ root.T, pose)
     matrix = _symmetric(_array(plain, "matrix", (n * (n + 1) // 2,), where), n)
     eigenvalues = np.linalg.eigvalsh(matrix)
     if eigenvalues[0] < -HEIGHT_TOLERANCE * abs(eigenvalues[-1]):
         raise MalformedError(f"{where}: matrix is not positive semidefinite (eigenvalue {eigenvalues[0]:.3g})")
     return HeightCovariance(directions, matrix, pose)
+
+
+def _root(plain: dict[str, Any], n: int, where: str) -> Array:
+    """Root (n, n), or of a plane (4, 3), of the covariance of n heights, in the file's units."""
+    numbers = _array(plain, "root", (None,), where)
+    plane = n == 4 and len(numbers) == 6
+    size = 3 if plane else n
+    if len(numbers) != size * (size + 1) // 2:
+        raise MalformedError(f"{where}: root is {len(numbers)}, wanted {n * (n + 1) // 2}")
+    root = np.zeros((size, size))
+    root.T[np.triu_indices(size)] = numbers
+    return np.asarray(FROM_THREE @ root) if plane else root
 
 
 def _pose(

@@ -1,6 +1,6 @@
 """The artifact of `fit` and `merge`: B-spline surfaces as JSON (.surfaces.json, .map.json; .gz by name).
 
-    {"format": "bsmap-surfaces", "version": 6, "units": "metres, radians, frame map",
+    {"format": "bsmap-surfaces", "version": 7, "units": "metres, radians, frame map",
      "bsmap-provenance": {...},
      "data_sets": [{"name", "movement": "translation" | "rotation", "first_scan", "last_scan", "points"}, ...],
      "poses": [{"data_set", "centre": [x, y], "trajectory": name,
@@ -30,7 +30,8 @@
         or, of control points that move along given directions only,
         "directions":          nu or 1 x nv or 1 x 3 unit vectors, units of 1e-5
         "scale", "root":       lower triangle L column by column, n (n + 1) / 2 numbers, n = nu nv: the heights'
-                               covariance is L L', in units of scale times 1e-8 m; or, of one that is nearly singular,
+                               covariance is L L', in units of scale times 1e-8 m; 6 numbers where n = 4: of the first
+                               three heights, all four lie in a plane; or, of one that is nearly singular,
         "matrix":              its upper triangle row by row, in square metres
         and "weights":         of the poses of the data sets, units of 1e-4; null for one without, [] where none has}
      "trims": [{"parameters": k x 2, u and v of a closed polygon, in steps of which 1 has ceil(2000 l): l is the longest
@@ -59,6 +60,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bsmap_cli.core.bspline import inner_knots
+from bsmap_cli.core.uncertainty import is_plane
 from bsmap_cli.errors import BadInputError, MissingInputError
 from bsmap_cli.io.artifact import Provenance, atomic_output, plain_json
 from bsmap_cli.io.surfaces_check import MalformedError, parse_map
@@ -88,7 +90,7 @@ from bsmap_cli.model import (
 )
 
 FORMAT = "bsmap-surfaces"
-VERSION = 6
+VERSION = 7
 
 
 def write_surfaces(path: Path | str, surfaces: SurfaceMap, provenance: Provenance | None = None) -> None:
@@ -184,7 +186,7 @@ def _covariance(covariance: SurfaceCovariance | HeightCovariance) -> dict[str, A
 
 def _heights(matrix: Array) -> dict[str, Any]:
     """Covariance of heights by its root, which needs fewer digits: what is small is no difference of what is large."""
-    found = scaled_root(matrix)
+    found = scaled_root(matrix[:3, :3] if is_plane(matrix) else matrix)
     if found is None:
         return {"matrix": _significant(_upper(matrix), 7)}
     return {"scale": found[0], "root": _upper(found[1].T).astype(int).tolist()}

@@ -23,6 +23,7 @@ from scipy.spatial.distance import cdist
 
 from bsmap_cli.core.bspline import clamped_knots
 from bsmap_cli.core.gaussian import symmetric_sqrt
+from bsmap_cli.core.uncertainty import TWIST, is_plane, with_twist
 from bsmap_cli.fit.heights import (
     HeightField,
     Knots,
@@ -111,7 +112,8 @@ def tell(face: BasedFace, frame: Frame, flatness: float, finest: Array) -> Told:
     places = places_on(field, grid)
     local = frame.base.local(places)
     n = normals(frame.base, places)
-    free, C = _free_heights(covariance.matrix) if face.round else (np.eye(len(covariance.matrix)), covariance.matrix)
+    C = with_twist(covariance.matrix) if is_plane(covariance.matrix) else covariance.matrix
+    free, C = _free_heights(C) if face.round else (np.eye(len(C)), C)
     basis = height_basis(face.surface, field, grid) @ free
     carry = np.asarray(np.linalg.pinv(basis), dtype=np.float64)
     by_pose = [carry @ _lifted(part, places, n) for part in covariance.pose]
@@ -212,7 +214,22 @@ def join(told: Sequence[Told], frame: Frame, finest: Array) -> Joined:
     own = _own_knots(told)
     if own.size > 4 and best.criterion > ENOUGH * sum(len(one.heights) for one in told):
         best = min(best, _improved(told, frame, own, least), key=lambda j: j.criterion)
-    return best
+    return _flattened(best) if best.field.knots.size == 4 and isinstance(frame.base, PlaneBase) else best
+
+
+def _flattened(joined: Joined) -> Joined:
+    """A bilinear patch whose twist does not pay for its parameter made a plane, by least squares.
+
+    The fourth height of a wall costs accuracy, at its corners most, where beams are few.
+    """
+    heights = joined.field.heights.ravel()
+    along = np.linalg.solve(joined.information, TWIST)
+    variance = TWIST @ along
+    if (TWIST @ heights) ** 2 >= PRICE * variance:
+        return joined
+    plane = np.eye(4) - np.outer(along, TWIST) / variance
+    field = replace(joined.field, heights=(plane @ heights).reshape(2, 2))
+    return joined._replace(field=field, gains=[plane @ K for K in joined.gains])
 
 
 def _improved(told: Sequence[Told], frame: Frame, knots: Knots, least: Array) -> Joined:

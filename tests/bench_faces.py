@@ -21,8 +21,10 @@ from face_scenes import (
     barrel_vault,
     corridor_set,
     dome,
+    egg,
     passing_set,
     real_room,
+    ring,
     simulated_place,
     tunnel,
     turning_set,
@@ -170,7 +172,7 @@ def simulated_rows(name, seeds):
 
 def curved_rows(seeds):
     """Vaults that are neither plane nor vertical cylinder, passed along and turned in."""
-    for mesh in (barrel_vault, tunnel, dome):
+    for mesh in (barrel_vault, tunnel, dome, egg, ring):
         places = [passing_set(mesh(), seed=seed) for seed in range(seeds)]
         show(f"{mesh.__name__} translation", [measure(place, np.arange(20)) for place in places])
         places = [turning_set(mesh(), np.array([1.0, 1.2, 0.3]), seed=seed) for seed in range(seeds)]

@@ -73,14 +73,42 @@ def tunnel():
     return join([arch(2.0, 1.0, 30), Mesh(floor.vertices, floor.triangles[level])])
 
 
+def half_ellipsoid(radii):
+    """Half an ellipsoid with such half axes (3,) on a floor, its centre at (1, 1)."""
+    around, up = np.meshgrid(np.radians(np.arange(361)), np.radians(np.linspace(0.0, 89.9, 181)), indexing="ij")
+    level = np.cos(up)
+    half = np.stack([level * np.cos(around), level * np.sin(around), np.sin(up)], axis=2)
+    return join([sheet(half * radii + [1.0, 1.0, 0.0]), ground(4.0)])
+
+
+def ground(half):
+    """Level square about (1, 1)."""
+    floor = carve([room(1.0 - half, 1.0 + half, 1.0 - half, 1.0 + half, 0.0, 0.1)])
+    level = np.all(floor.vertices[floor.triangles, 2] < 0.01, axis=1)
+    return Mesh(floor.vertices, floor.triangles[level])
+
+
 def dome():
     """Half a sphere on a floor."""
     around, up = np.meshgrid(np.radians(np.arange(361)), np.radians(np.linspace(0.0, 89.9, 91)), indexing="ij")
     level = np.cos(up)
     half = sheet(3.0 * np.stack([level * np.cos(around), level * np.sin(around), np.sin(up)], axis=2) + [1.0, 1.0, 0.0])
-    floor = carve([room(-2.0, 4.0, -2.0, 4.0, 0.0, 0.1)])
-    level = np.all(floor.vertices[floor.triangles, 2] < 0.01, axis=1)
-    return join([half, Mesh(floor.vertices, floor.triangles[level])])
+    return join([half, ground(3.0)])
+
+
+def egg():
+    """A vault bent both ways, differently everywhere."""
+    return half_ellipsoid((3.0, 2.0, 2.5))
+
+
+def ring():
+    """Tunnel of 2 m around a bend of 6 m, with a flat floor 1 m below its axis, which passes (1, 1)."""
+    along, around = np.meshgrid(
+        np.radians(np.linspace(-60.0, 60.0, 241)), np.radians(np.linspace(-30.0, 210.0, 241)), indexing="ij"
+    )
+    out = 6.0 + 2.0 * np.cos(around)
+    tube = np.stack([1.0 + out * np.sin(along), out * np.cos(along) - 5.0, 1.0 + 2.0 * np.sin(around)], axis=2)
+    return join([sheet(tube), ground(12.0)])
 
 
 @cache

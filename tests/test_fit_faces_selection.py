@@ -33,14 +33,14 @@ def many_knots():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_all_knots_of_a_flat_face_leave(seed):
-    fitted = refit(field_on(many_knots()), blocks_of(lambda s, t: 0.1 * s - 0.2 * t, seed), SIGMA, fewer=True)
+    fitted = refit(field_on(many_knots()), blocks_of(lambda s, t: 0.1 * s - 0.2 * t, seed), SIGMA, choose=True)
     assert fitted.field.knots.size == 4
 
 
 def test_the_knot_at_a_bend_stays():
     blocks = blocks_of(lambda s, t: 0.1 * np.maximum(s - 2.0, 0.0) ** 2)
     knots = Knots(2, 1, clamped_knots(2, np.array([0.2, 0.5, 0.7])), open_knots(1))
-    fitted = refit(field_on(knots), blocks, SIGMA, fewer=True)
+    fitted = refit(field_on(knots), blocks, SIGMA, choose=True)
     np.testing.assert_array_equal(inner_knots(fitted.field.knots.s, fitted.field.knots.degree_s), [0.5])
 
 
@@ -54,7 +54,7 @@ def test_least_surface_over_a_cylinder_keeps_its_knots():
     base, low, high = CylinderBase(np.zeros(2), 1.0, 0.0), np.array([-2.0, 0.0]), np.array([2.0, 2.0])
     least = least_knots(base, low, high)
     knots = Knots(3, 2, clamped_knots(3, np.array([0.25, 0.5, 0.75])), open_knots(2))
-    fitted = refit(HeightField(base, low, high, knots, np.zeros(knots.shape)), blocks, SIGMA, fewer=True)
+    fitted = refit(HeightField(base, low, high, knots, np.zeros(knots.shape)), blocks, SIGMA, choose=True)
     assert fitted.field.knots.shape == least.shape
     assert fitted.field.knots.degree_s == least.degree_s
 
@@ -62,7 +62,7 @@ def test_least_surface_over_a_cylinder_keeps_its_knots():
 def test_a_knot_whose_data_have_gone_to_another_face_leaves():
     blocks = blocks_of(lambda s, t: 0.02 * s**2, until=3.0)
     knots = Knots(2, 1, clamped_knots(2, np.array([0.75, 0.9])), open_knots(1))
-    fitted = refit(field_on(knots), blocks, SIGMA, fewer=True)
+    fitted = refit(field_on(knots), blocks, SIGMA, choose=True)
     assert fitted.field.knots.shape == (3, 2)
     np.testing.assert_allclose(fitted.field.heights[-1], 0.02 * 16.0, atol=0.02)
 
@@ -71,11 +71,19 @@ def test_fewer_knots_are_never_the_worse_choice():
     for seed in range(3):
         blocks = blocks_of(lambda s, t: 0.03 * np.sin(2.0 * s) * np.cos(t), seed)
         kept = refit(field_on(many_knots()), blocks, SIGMA)
-        fewer = refit(field_on(many_knots()), blocks, SIGMA, fewer=True)
+        fewer = refit(field_on(many_knots()), blocks, SIGMA, choose=True)
         assert fewer.criterion <= kept.criterion + 1e-6
         chosen = fit_heights(blocks, PLANE, LOW, HIGH, SIGMA)
-        again = refit(chosen.field, blocks, SIGMA, fewer=True)
+        again = refit(chosen.field, blocks, SIGMA, choose=True)
         assert again.criterion > chosen.criterion - PRICE
+
+
+def test_knots_that_new_data_pay_for_are_added():
+    blocks = blocks_of(lambda s, t: 0.03 * np.sin(2.0 * s) * np.cos(t))
+    few = Knots(2, 1, open_knots(2), open_knots(1))
+    chosen = fit_heights(blocks, PLANE, LOW, HIGH, SIGMA)
+    as_it_is, now = (refit(field_on(few), blocks, SIGMA, choose=choose).criterion for choose in (False, True))
+    assert now - chosen.criterion < 0.05 * (as_it_is - chosen.criterion)
 
 
 def test_the_least_surface_tells_all_it_knows_and_others_less():

@@ -9,7 +9,7 @@ from face_scenes import corridor_set
 from bsmap_cli.evaluate import distance_to_mesh
 from bsmap_cli.fit.beams import make_grid
 from bsmap_cli.fit.division import find_faces
-from bsmap_cli.fit.labels import feet_of_faces, move_breaks
+from bsmap_cli.fit.labels import _best_breaks, feet_of_faces, move_breaks
 from bsmap_cli.fit.sides import on_their_sides
 
 
@@ -71,6 +71,19 @@ def test_a_tangle_of_beams_beside_a_crease_becomes_one_border(corridor):
         assert np.count_nonzero(np.diff(found[scan, at - 6 : at + 6])) == 1
 
 
+def test_border_of_surfaces_that_touch_is_where_they_do_whatever_the_noise():
+    rng = np.random.default_rng(0)
+    noise = 0.01 * rng.standard_normal((50, 29))
+    # One goes on in the other, 1 mm apart at the tenth beam; beyond it they leave each other slowly.
+    apart = 0.001 + 0.0001 * (np.arange(29) - 10.0) ** 2
+    before = np.arange(29) < 10
+    found = _best_breaks(noise + ~before * apart, noise - before * apart, np.full(50, 13), 0.01)
+    np.testing.assert_array_equal(found, 10)
+    # Surfaces apart by more than the noise everywhere: the noise of single beams hardly matters.
+    jump = np.where(np.arange(29) < 17, noise, noise + 0.2), np.where(np.arange(29) < 17, noise + 0.2, noise)
+    assert np.all(_best_breaks(*jump, np.full(50, 13), 0.01) == 17)
+
+
 def test_largest_error_at_30_mm_noise_is_that_of_the_noise():
     place = corridor_set(0.03, 8)
     grid = make_grid(place.cloud, np.arange(20))
@@ -78,3 +91,11 @@ def test_largest_error_at_30_mm_noise_is_that_of_the_noise():
     feet = feet_of_faces(grid, faces.labels, [fitted.field for fitted in faces.fitted])
     points = np.concatenate([of.points for of in feet])
     assert distance_to_mesh(points, place.vertices, place.triangles).max() < 0.03
+
+
+def test_runs_of_a_beam_at_the_first_and_the_last_beam_are_no_matter(corridor):
+    grid, labels, fields, sigma = corridor
+    edge = labels.copy()
+    edge[:, 0], edge[:, -1] = labels[:, 1] + 1, labels[:, -2] + 1
+    edge %= len(fields)
+    assert np.mean(on_their_sides(grid, edge, fields, sigma)[:, 1:-1] == labels[:, 1:-1]) > 0.999

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from face_scenes import barrel_vault, dome, passing_set, tunnel, turning_set
+from face_scenes import barrel_vault, dome, egg, passing_set, ring, tunnel, turning_set
 
 from bsmap_cli.core.bspline import evaluate_surface
 from bsmap_cli.evaluate import distance_to_mesh
@@ -126,3 +126,22 @@ def test_a_sphere_is_found_from_a_part_of_it_and_its_axis_is_away_from_it():
     ones = np.ones(600)
     all_around = Blocks(everywhere, everywhere, ones, ones.astype(int), ones, ones.astype(int))
     assert sphere_axes(all_around, fit_sphere_frame(all_around)) is None
+
+
+@pytest.mark.parametrize(("scene", "share"), [(egg, 0.9), (ring, 0.87)])
+def test_covariance_holds_where_faces_bend_both_ways(scene, share):
+    place = passing_set(scene())
+    grid = make_grid(place.cloud, np.arange(20))
+    faces = find_faces(grid)
+    assert np.mean(faces.labels[grid.hit] >= 0) > 0.998
+    inside = []
+    for fitted, feet in zip(
+        faces.fitted, feet_of_faces(grid, faces.labels, [f.field for f in faces.fitted]), strict=True
+    ):
+        error = distance_to_mesh(feet.points, place.vertices, place.triangles)
+        N = basis_matrix(fitted.field.knots, feet.uv)
+        tilt = 1.0 + np.sum(evaluate(fitted.field, feet.uv)[1] ** 2, axis=1)
+        variance = np.sum((N @ np.linalg.inv(fitted.information)) * N, axis=1) / tilt
+        assert np.sqrt(np.mean(error**2)) < 0.0025
+        inside.append(error**2 < 3.84 * variance)
+    assert np.mean(np.concatenate(inside)) > share

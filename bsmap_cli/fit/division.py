@@ -130,7 +130,8 @@ def _widened(grid: BeamGrid, labels: IntArray, fitted: list[Fitted], sigma: floa
             high = np.where(high > field.high, high + margin, high)
             field = replace(field, low=low, high=high)
         if field is not old.field or curved:
-            old = refit(field, beams if curved else blocks, sigma)
+            # Where a face bends both ways, means of beams hide what the beams themselves ask for.
+            old = refit(field, beams if curved else blocks, sigma, choose=curved and min(field.knots.shape) > 2)
         out.append(old)
     return out
 
@@ -225,11 +226,11 @@ def _fit(grid: BeamGrid, member: NDArray[np.bool_], blocks: Blocks, sigma: float
 
 
 def _refit_all(grid: BeamGrid, labels: IntArray, fields: list[HeightField], sigma: float) -> list[Fitted]:
-    """Faces fitted anew on their knots; where the beams now ask for the other kind of base, from the beginning."""
+    """Faces fitted anew on the knots that now pay; where beams ask for the other kind of base, from the beginning."""
     out = []
     for number, (field, blocks) in enumerate(zip(fields, blocks_of_faces(grid, labels), strict=True)):
         same = any(type(base) is type(field.base) for base in bases(blocks, sigma))
-        out.append(refit(field, blocks, sigma, True) if same else _fit(grid, labels == number, blocks, sigma))
+        out.append(refit(field, blocks, sigma, choose=True) if same else _fit(grid, labels == number, blocks, sigma))
     return out
 
 

@@ -24,6 +24,8 @@ NEXT = ((-1, 0), (1, 0), (0, -2), (0, -1), (0, 1), (0, 2))
 CHUNK = 20_000
 """Beams whose neighbourhoods are added up at a time."""
 PASSES = 30
+TOUCHING = 1.0
+"""Standard deviations within which two surfaces touch."""
 GAP = 3
 """Beams of the rest that may lie at a border."""
 SHORT = 3
@@ -328,7 +330,8 @@ def _move(grid: BeamGrid, labels: IntArray, table: Table, borders: _Borders, sig
 def _best_breaks(a: Array, b: Array, now: IntArray, sigma: float) -> IntArray:
     """Place (k,) of the first beam of the second face, of beams with distances a and b (k, w) to the two faces.
 
-    Where the surfaces cross near the border: the crossing. Else where the squared distances are least in sum. nan for
+    Where the surfaces cross near the border: the crossing; where they touch, the nearest place. Else where the squared
+    distances are least in sum. nan for
     beams without; where fewer than two are left, the place is `now` (k,).
     """
     count = np.count_nonzero(np.isfinite(a), axis=1)
@@ -344,6 +347,11 @@ def _best_breaks(a: Array, b: Array, now: IntArray, sigma: float) -> IntArray:
     least = total.min(axis=1, keepdims=True)
     crossing = np.zeros(total.shape, dtype=bool)
     crossing[:, 1:-1] = (np.sign(a - b)[:, 1:] != np.sign(a - b)[:, :-1]) & known[:, 1:]
+    # Surfaces that only touch go on in each other: where the noise would have the border tells nothing.
+    gap = np.where(known, np.abs(a - b), np.inf)
+    nearest = gap.argmin(axis=1)
+    touching = np.flatnonzero((gap.min(axis=1) < TOUCHING * sigma) & ~crossing.any(axis=1) & (nearest > 0))
+    crossing[touching, nearest[touching]] = True
     # A crossing is believed where it explains the beams nearly as well as the best break.
     good = crossing & (total < least + 25.0 * sigma**2)
     best = np.where(good.any(axis=1), np.argmin(np.where(good, total, np.inf), axis=1), np.argmin(total, axis=1))

@@ -124,12 +124,14 @@ def _is_near(best: _Solution, field: HeightField, sigma: float) -> bool:
     return best.knots is field.knots and bool(np.abs(best.heights - field.heights.ravel()).max() < NEAR * sigma)
 
 
-def refit(field: HeightField, blocks: Blocks, sigma: float, fewer: bool = False) -> Fitted:
-    """Fit on the degrees and knots that a field has; fewer: without those that do not pay."""
-    if not fewer or field.knots.size == least_knots(field.base, field.low, field.high).size:
+def refit(field: HeightField, blocks: Blocks, sigma: float, choose: bool = False) -> Fitted:
+    """Fit on the degrees and knots that a field has; choose: on those that now pay, unless it is the least surface."""
+    if not choose or field.knots.size == least_knots(field.base, field.low, field.high).size:
         return _settled(field, blocks, sigma, None)
     data = _linearise(field, blocks, sigma)
+    # What no data bear any more goes first: it would stand in the way of other steps.
     best = _climb(_solve(field.knots, data), data, (_fewer_steps,))
+    best = _climb(best, data, (_single_steps, _double_steps, _fewer_steps))
     return _settled(best.on(field), blocks, sigma, data)
 
 

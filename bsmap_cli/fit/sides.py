@@ -27,6 +27,7 @@ def on_their_sides(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightFiel
         half = np.minimum((stop[own] - start[own]) // 2, 2 * BEYOND)
         # The last one, inside the run, tells which surface is nearer there.
         at = first[:, None] + step * np.append(np.broadcast_to(np.arange(BEYOND), (len(own), BEYOND)), half[:, None], 1)
+        at = np.clip(at, 0, labels.shape[1] - 1)
         r = np.broadcast_to(row[own, None], at.shape)
         k, i = np.nonzero((np.arange(BEYOND + 1) < half[:, None]) | (np.arange(BEYOND + 1) == BEYOND))
         seen = grid.hit[r[k, i], at[k, i]]

@@ -18,7 +18,7 @@ def on_their_sides(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightFiel
     """Labels, the last beams of runs before another face given to that one where they lie beyond the crease.
 
     Which of two surfaces is nearer along a beam, the noise does not touch: on the other side of their crease it is the
-    other one. Beams that neither side explains go to the rest.
+    other one. Where that one does not explain the beam, the two do not meet there, and it stays.
     """
     table, labels = tabulate(fields), labels.copy()
     (row, start, stop, label), near = _joined(runs_of(labels))
@@ -40,8 +40,9 @@ def on_their_sides(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightFiel
         wrong = np.logical_and.accumulate((sign[:, :-1] * sign[:, -1:] < 0.0) | np.isnan(sign[:, :-1]), axis=1)
         wrong &= labels[r[:, :-1], at[:, :-1]] == label[own, None]
         k, i = np.nonzero(wrong)
-        new = np.where(np.abs(to_other[k, i]) < OUTLIER * sigma, label[other[k]], -1)
-        labels[r[k, i], at[k, i]] = new
+        explained = np.abs(to_other[k, i]) < OUTLIER * sigma
+        k, i = k[explained], i[explained]
+        labels[r[k, i], at[k, i]] = label[other[k]]
     return fill(grid, labels)
 
 

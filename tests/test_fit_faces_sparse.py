@@ -2,13 +2,15 @@
 
 import numpy as np
 import pytest
-from face_scenes import corridor_set
+from face_scenes import corridor_mesh, corridor_set, turning_set
 
 from bsmap_cli.evaluate import distance_to_mesh, surface_samples
 from bsmap_cli.fit.beams import make_grid
 from bsmap_cli.fit.claims import claim, directions_of
 from bsmap_cli.fit.context import make_context
+from bsmap_cli.fit.division import find_faces
 from bsmap_cli.fit.faces import fit_set
+from bsmap_cli.fit.labels import feet_of_faces
 from bsmap_cli.fit.pieces import find_pieces
 from bsmap_cli.model import SurfaceMap
 
@@ -24,6 +26,16 @@ def test_nothing_bridges_a_pillar_and_the_wall_beside_it(scans):
     samples = surface_samples(SurfaceMap(tuple(made.surfaces), ()), 0.05)
     assert distance_to_mesh(samples, place.vertices, place.triangles).max() < 0.03
     assert len(made.surfaces) >= 5
+
+
+def test_no_face_of_a_turn_runs_away_from_what_it_was_fitted_to():
+    # A bent sheet ends freely: of what lies behind it, much is nearly as well explained by bending it on.
+    place = turning_set(corridor_mesh(), np.array([1.9, 1.0, 0.0]))
+    grid = make_grid(place.cloud, np.arange(19))
+    faces = find_faces(grid)
+    feet = feet_of_faces(grid, faces.labels, [fitted.field for fitted in faces.fitted])
+    points = np.concatenate([of.points for of in feet])
+    assert distance_to_mesh(points, place.vertices, place.triangles).max() < 0.03
 
 
 @pytest.fixture(scope="module")

@@ -11,16 +11,15 @@ import numpy as np
 
 from bsmap_cli.fit.context import PRICE, Context
 from bsmap_cli.fit.lowmodels import ORDERS, PlaneFrame, Sums, chi_squares, fit_plane_frame, sums_of
-from bsmap_cli.fit.seeds import PAIR_BEAMS, SEED_INCIDENCE
+from bsmap_cli.fit.seeds import PAIR_BEAMS, SEED_INCIDENCE, pairs
 from bsmap_cli.model import Array, IntArray
 
 FEWEST_SCANS = 3
 """Of a plane that may claim scan lines, and of what is left of a region."""
 FEW_SCANS = 5
 """A region of no more scans may lie on its surface by chance."""
-
-SQUARE = np.radians(2.0)
-"""From a right angle, that two planes may be and still are square."""
+ALIKE = np.radians(2.0)
+"""Between the normals of planes that lie alike; from a right angle, those of planes that are square to each other."""
 
 
 class _Plane(NamedTuple):
@@ -62,12 +61,26 @@ def claim(context: Context, regions: list[list[int]], owner: IntArray) -> list[l
     return kept
 
 
+def join_pairs(context: Context, regions: list[list[int]], owner: IntArray) -> list[list[int]]:
+    """Regions and those pairs of pieces whose plane lies like planes of many scans, or square to two of these.
+
+    A plane that bridges a jump hardly ever lies like that.
+    """
+    out, directions = list(regions), None
+    for pair, frame in pairs(context, owner):
+        directions = directions_of(context, regions) if directions is None else directions
+        if np.abs(directions @ frame.axes[:, 2]).max(initial=0.0) > np.cos(ALIKE):
+            owner[pair] = len(out)
+            out.append(pair)
+    return out
+
+
 def directions_of(context: Context, regions: list[list[int]]) -> Array:
     """(k, 3) unit normals of the planes of many scans, and what is square to two that are square to each other."""
     scans = [_scans(context, members) for members in regions]
     sure = [_plane(context, regions[k], scans[k]) for k in range(len(regions)) if scans[k] > FEW_SCANS]
     normals = np.array([plane.frame.axes[:, 2] for plane in sure if plane is not None]).reshape(-1, 3)
-    a, b = np.nonzero(np.triu(np.abs(normals @ normals.T) < np.sin(SQUARE), 1))
+    a, b = np.nonzero(np.triu(np.abs(normals @ normals.T) < np.sin(ALIKE), 1))
     across = np.cross(normals[a], normals[b])
     return np.concatenate([normals, across / np.linalg.norm(across, axis=1, keepdims=True)])
 

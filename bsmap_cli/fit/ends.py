@@ -55,11 +55,12 @@ def find_ends(grid: BeamGrid, labels: IntArray, crossings: Crossings) -> Ends:
     out[k] = labels[row[k], stop[k]]
     place = grid.before.place % n
     middle = place[first + (behind - first) // 2]
-    length = stop - start
-    at = np.arange(length.sum()) + np.repeat(row * n + start - np.cumsum(length) + length, length)
-    found = np.full((6, m * n), -1)
-    found[:, at] = np.repeat(np.stack([into, out, place[first], place[behind - 1], middle, middle]), length, axis=1)
-    return Ends(*found.reshape(3, 2, m, n))
+    of_runs = np.stack([into, out, place[first], place[behind - 1], middle, middle])
+    # Runs and what lies between them, in turns.
+    values = np.full((6, 2 * len(row) + 1), -1)
+    values[:, 1::2] = of_runs
+    bounds = np.column_stack([row * n + start, row * n + stop]).ravel()
+    return Ends(*np.repeat(values, np.diff(bounds, prepend=0, append=m * n), axis=1).reshape(3, 2, m, n))
 
 
 def on_faces(grid: BeamGrid, labels: IntArray, feet: Sequence[Feet]) -> BeamGrid:

@@ -12,7 +12,7 @@ from collections import deque
 import numpy as np
 
 from bsmap_cli.fit.beams import BeamGrid
-from bsmap_cli.fit.claims import claim, directions_of
+from bsmap_cli.fit.claims import claim, join_pairs
 from bsmap_cli.fit.context import PRICE, Context, make_context
 from bsmap_cli.fit.grazing import GRAZED, STEEPER
 from bsmap_cli.fit.lowmodels import (
@@ -27,7 +27,7 @@ from bsmap_cli.fit.lowmodels import (
     weighted_rows,
 )
 from bsmap_cli.fit.pieces import Pieces
-from bsmap_cli.fit.seeds import bent_seeds, cylinder_seeds, pairs, plane_seeds, rough_normal
+from bsmap_cli.fit.seeds import bent_seeds, cylinder_seeds, plane_seeds, rough_normal
 from bsmap_cli.fit.unions import unite_regions
 from bsmap_cli.model import IntArray
 
@@ -47,10 +47,7 @@ def find_regions(grid: BeamGrid, pieces: Pieces) -> tuple[list[list[int]], float
             grown = _grow(context, owner, seed, frame)
             owner[grown] = len(regions)
             regions.append(grown)
-    regions = claim(context, regions, owner)
-    for pair in pairs(context, owner, directions_of(context, regions)):
-        owner[pair] = len(regions)
-        regions.append(pair)
+    regions = join_pairs(context, claim(context, regions, owner), owner)
     return unite_regions(context, without_grazed_scans(context, regions, owner)), context.sigma
 
 

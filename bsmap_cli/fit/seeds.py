@@ -14,11 +14,7 @@ SEED_INCIDENCE = 0.15
 
 PAIR_BEAMS, PAIR_OVERLAP, PAIR_INCIDENCE = 20, 0.8, 0.5
 """Of a face that only two scans tell of: beams in each, share of the longer piece before beams of the other, sine of
-incidence. Two scan lines nearly always fit a plane: long ones that end together, seen steeply, are believed
-where their plane lies like others."""
-PAIR_ANGLE = np.radians(2.0)
-"""By which its normal may differ from that of a plane that more scans tell of, or from what is square to two of these:
-a plane that bridges a jump hardly ever lies like that."""
+incidence. Two scan lines nearly always fit a plane: long ones that end together, seen steeply, may be believed."""
 
 Seed = tuple[list[int], Frame]
 
@@ -84,8 +80,8 @@ def cylinder_seeds(context: Context, owner: IntArray) -> Iterator[Seed]:
                 break
 
 
-def pairs(context: Context, owner: IntArray, directions: Array) -> Iterator[list[int]]:
-    """Free pieces of two successive scans that lie in a plane which no third scan sees; its normal is among (k, 3)."""
+def pairs(context: Context, owner: IntArray) -> Iterator[tuple[list[int], PlaneFrame]]:
+    """Free pieces of two successive scans that lie in a plane which no third scan sees."""
     start, stop, row = context.pieces.start, context.pieces.stop, context.pieces.row
     for first in np.flatnonzero((owner < 0) & (context.beams >= PAIR_BEAMS) & ~context.pieces.curved).tolist():
         for second in context.neighbours[first]:
@@ -98,10 +94,8 @@ def pairs(context: Context, owner: IntArray, directions: Array) -> Iterator[list
             blocks = context.blocks_of(pair)
             frame = fit_plane_frame(blocks, rough_normal(context, pair))
             sums = sums_of(frame, blocks, context.sigma)
-            aligned = np.abs(directions @ frame.axes[:, 2]).max(initial=0.0) > np.cos(PAIR_ANGLE)
-            if aligned and _incidence(frame, blocks) > PAIR_INCIDENCE and joint_excess(context, pair, sums, 3) < 0.0:
-                yield pair
-                break
+            if _incidence(frame, blocks) > PAIR_INCIDENCE and joint_excess(context, pair, sums, 3) < 0.0:
+                yield pair, frame
 
 
 def rough_normal(context: Context, chain: list[int]) -> Array | None:

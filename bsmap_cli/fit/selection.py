@@ -116,7 +116,7 @@ def fit_heights(blocks: Blocks, base: Base, low: Array, high: Array, sigma: floa
     field = best.on(field)
     data = _linearise(field, blocks, sigma, data)
     best = _climb(_solve(best.knots, data), data, (_single_steps, _double_steps, _fewer_steps))
-    return best.fitted(field) if _is_near(best, field, sigma) else _settled(best.on(field), blocks, sigma, data)
+    return best.fitted(field) if _is_near(best, field, sigma) else _settled(best.on(field), blocks, sigma, data)[0]
 
 
 def _is_near(best: _Solution, field: HeightField, sigma: float) -> bool:
@@ -127,24 +127,26 @@ def _is_near(best: _Solution, field: HeightField, sigma: float) -> bool:
 def refit(field: HeightField, blocks: Blocks, sigma: float, choose: bool = False) -> Fitted:
     """Fit on the degrees and knots that a field has; choose: on those that now pay, unless it is the least surface."""
     if not choose or field.knots.size == least_knots(field.base, field.low, field.high).size:
-        return _settled(field, blocks, sigma, None)
+        return _settled(field, blocks, sigma, None)[0]
     data = _linearise(field, blocks, sigma)
     # What no data bear any more goes first: it would stand in the way of other steps.
-    best = _climb(_solve(field.knots, data), data, (_fewer_steps,))
-    best = _climb(best, data, (_single_steps, _double_steps, _fewer_steps))
-    return _settled(best.on(field), blocks, sigma, data)
+    fewer = _climb(_solve(field.knots, data), data, (_fewer_steps,))
+    best = _climb(fewer, data, (_single_steps, _double_steps, _fewer_steps))
+    found, change = _settled(best.on(field), blocks, sigma, data)
+    # More knots about a surface that is far from the data may follow equations that hold nowhere.
+    return found if change < sigma or best is fewer else _settled(fewer.on(field), blocks, sigma, data)[0]
 
 
-def _settled(field: HeightField, blocks: Blocks, sigma: float, data: _Data | None) -> Fitted:
-    """Fit on a field's knots, repeated about its own result; data: about one near it."""
+def _settled(field: HeightField, blocks: Blocks, sigma: float, data: _Data | None) -> tuple[Fitted, float]:
+    """Fit on a field's knots, repeated about its own result, and metres of its last change; data: about one near it."""
     for _ in range(2):
         data = _linearise(field, blocks, sigma, data)
         best = _solve(field.knots, data)
-        change = np.abs(best.heights - field.heights.ravel()).max()
+        change = float(np.abs(best.heights - field.heights.ravel()).max())
         field = best.on(field)
         if change < SETTLED:
             break
-    return best.fitted(field)
+    return best.fitted(field), change
 
 
 def told(knots: Knots, least: Knots) -> float:

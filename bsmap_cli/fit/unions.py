@@ -8,6 +8,7 @@ import numpy as np
 from bsmap_cli.fit.blocks import Blocks, thinned
 from bsmap_cli.fit.context import PRICE, Context
 from bsmap_cli.fit.lowmodels import (
+    ENOUGH_BLOCKS,
     ORDERS,
     PlaneFrame,
     SphereFrame,
@@ -109,7 +110,8 @@ def _low_order_cost(blocks: Blocks, sums: Sums, sigma: float) -> LowOrder:
         by_circle = _cost_of_cylinder(blocks, None, sigma)
         if by_circle < found.cost:
             found = LowOrder(by_circle, True, True, by_circle > poor)
-    if best > 0 and found.cost > poor and len(blocks.counts) >= DOME and (ball := fit_sphere_frame(blocks)) is not None:
+    hollow = best > 0 and found.cost > poor and len(blocks.counts) >= DOME
+    if hollow and (ball := fit_sphere_frame(_some(blocks))) is not None:
         by_sphere = float(chi_squares(sums_of(ball, blocks, sigma), (4,))[0]) + 5 * PRICE
         if by_sphere < found.cost and (axes := sphere_axes(blocks, ball)) is not None:
             found = LowOrder(by_sphere, True, True, by_sphere > poor, axes, ball)
@@ -129,8 +131,13 @@ def _costs(sums: Sums, rows: int) -> Array:
 def _cost_of_cylinder(blocks: Blocks, axes: Array | None, sigma: float) -> float:
     """Criterion of the cylinder along the third of `axes`, or a vertical one; infinite where there is none."""
     blocks = turned(blocks, axes)
-    cylinder = fit_cylinder_frame(blocks)
+    cylinder = fit_cylinder_frame(_some(blocks))
     return np.inf if cylinder is None else float(chi_squares(sums_of(cylinder, blocks, sigma), (3,))[0]) + 4 * PRICE
+
+
+def _some(blocks: Blocks) -> Blocks:
+    """Blocks enough, evenly taken, to tell about which circle or sphere the equations of all are made linear."""
+    return blocks.pick(slice(None, None, -(-len(blocks.counts) // ENOUGH_BLOCKS[1])))
 
 
 def _joined(context: Context, a: _Region, b: _Region) -> _Region | None:

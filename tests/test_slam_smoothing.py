@@ -189,6 +189,16 @@ def test_two_faces_of_a_wall_are_two_lines():
     assert len(found.line) == len(case.segments.scan)
 
 
+def test_lines_out_of_sight_change_no_pair_wherever_they_stand_in_the_map():
+    case, spread = Case(9), (0.05, 0.015)
+    far, ends = np.repeat([[0.3, 60.0], [-2.0, 45.0]], 20, axis=0), np.tile([-1.0, 1.0], (40, 1))
+    alone = match_all(case.truth, WALLS, ENDS, case.segments, GATE, MARGIN, spread)
+    lines, extents = np.vstack([far, WALLS]), np.vstack([ends, ENDS])
+    among = match_all(case.truth, lines, extents, case.segments, GATE, MARGIN, spread)
+    np.testing.assert_array_equal(among.line, alone.line + len(far))
+    np.testing.assert_array_equal(among.segment, alone.segment)
+
+
 def test_sides_of_lines_in_the_map_are_turned_to_the_robot_and_do_not_change_the_answer():
     case = Case(10)
     lines = case.lines

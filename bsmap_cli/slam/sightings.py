@@ -3,17 +3,20 @@
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bsmap_cli.core import se2
 from bsmap_cli.core.gaussian import chi2_gate
 from bsmap_cli.model import Array, IntArray
 from bsmap_cli.slam.posegraph import ROBUST_WIDTH, Term, robust_means
 from bsmap_cli.slam.segments import Segments
+from bsmap_cli.slam.shelf import distances
 
 AT_ONCE = 100
-"""Segments compared with all lines at a time."""
-MOST_TURN = 0.2
-"""Radians between a segment and a line that it may be part of."""
+"""Segments compared with the lines about them at a time."""
+MOST_TURN, BEYOND_SIGHT = 0.2, 5.0
+"""Radians between a segment and a line that it may be part of; metres that a line may be farther off than anything that
+was seen."""
 
 
 class Sightings(NamedTuple):
@@ -83,6 +86,8 @@ def _beside(
     """
     pose, seen = poses[segments.scan[rows]], segments.parameters[rows]
     in_map = extents_of(pose, seen, segments.extents[rows])
+    within = np.flatnonzero(_within_sight(pose, seen, segments.extents[rows], lines, extents))
+    lines, extents = lines[within], extents[within]
     turn = se2.wrap((seen[:, 0] + pose[:, 2])[:, None] - lines[:, 0])
     a, b = np.nonzero(np.abs(turn) < MOST_TURN)
     overlap = np.minimum(in_map[a, 1], extents[b, 1]) - np.maximum(in_map[a, 0], extents[b, 0])
@@ -92,7 +97,7 @@ def _beside(
     alpha = lines[b, 0]
     r = lines[b, 1] - pose[a, 0] * np.cos(alpha) - pose[a, 1] * np.sin(alpha)
     middle = segments.extents[rows[a]].mean(axis=1)
-    return a, b, turn, seen[a, 1] - r - turn * middle
+    return a, within[b], turn, seen[a, 1] - r - turn * middle
 
 
 def with_rivals(
@@ -122,6 +127,17 @@ def with_rivals(
         for k, difference in enumerate((turn - own[1, a], apart - own[2, a])):
             np.maximum.at(rival[some, k], a[near], difference[near] ** 2)
     return sightings._replace(rival=rival)
+
+
+def _within_sight(poses: Array, seen: Array, seen_extents: Array, lines: Array, extents: Array) -> NDArray[np.bool_]:
+    """(m,) lines no farther from the middle of some poses (k, 3) than what was seen (k, 2) from any of them may be.
+
+    For the others the time would grow with the square of the building.
+    """
+    middle = poses[:, :2].mean(axis=0)
+    around = np.hypot(*(poses[:, :2] - middle).T).max()
+    farthest = np.hypot(seen[:, 1], np.abs(seen_extents).max(axis=1)).max()
+    return distances(middle, lines, extents) < around + farthest + BEYOND_SIGHT
 
 
 def extents_of(poses: Array, parameters: Array, extents: Array) -> Array:

@@ -78,7 +78,9 @@ def areas(meshes):
                 other = found["primitive_normals"].numpy()
                 across = np.abs(np.sum(way * normals, axis=1))
                 along = np.sqrt(np.maximum(np.sum(way**2, axis=1) - across**2, 0.0))
-                layers += (across < 0.03) & (along < 0.005) & (np.abs(np.sum(other * normals, axis=1)) > 0.9)
+                # Inside the other face its foot lies along its normal; beside its border, at a smooth seam, not.
+                parallel = np.abs(np.sum(other * normals, axis=1)) > 0.9
+                layers += (across < 0.03) & (along < 0.5 * across + 1e-4) & parallel
         total += area
         single += area * np.mean(1.0 / layers) if len(points) else area
     return total, total - single

@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 
 from bsmap_cli.fit.blocks import Blocks
-from bsmap_cli.fit.lowmodels import GRAZING, axes_of, ball_rows, fit_cylinder_frame, fit_plane_frame, plane_rows
+from bsmap_cli.fit.lowmodels import (
+    GRAZING,
+    _least_squares,
+    axes_of,
+    ball_rows,
+    fit_cylinder_frame,
+    fit_plane_frame,
+    plane_rows,
+)
 
 
 def blocks_at(points, directions, counts):
@@ -55,3 +63,18 @@ def test_axes_are_orthonormal_and_level_where_the_normal_is_not_steep():
         assert np.linalg.det(axes) == pytest.approx(1.0)
         np.testing.assert_allclose(axes[:, 2], normal / np.linalg.norm(normal), atol=1e-15)
         assert axes[2, 0] == 0.0 or abs(axes[2, 2]) > 0.8
+
+
+def test_three_unknowns_are_those_of_many_systems_at_once():
+    rng = np.random.default_rng(0)
+    for scale in (1.0, 1e-4, 1e6):
+        rows = rng.standard_normal((50, 4)) * [1.0, scale, 1.0, 1.0]
+        G = rows.T @ rows
+        wanted = np.linalg.lstsq(rows[:, :3], rows[:, 3], rcond=None)[0]
+        np.testing.assert_allclose(_least_squares(G), wanted, rtol=1e-8)
+        np.testing.assert_allclose(_least_squares(np.stack([G, G]))[1], wanted, rtol=1e-8)
+        assert _least_squares(G[None]).shape == (1, 3)
+    # Of what the rows do not tell, nearly the least.
+    rows[:, 1] = rows[:, 0]
+    np.testing.assert_allclose(_least_squares(rows.T @ rows)[0], _least_squares(rows.T @ rows)[1], rtol=1e-2)
+    assert np.all(np.isfinite(_least_squares(np.zeros((4, 4)))))

@@ -82,6 +82,10 @@ def _derivative(k: int, lower: Array, inverse_widths: Array) -> Array:
 def design_matrix(knots: Array, degree: int, u: ArrayLike, derivative: int = 0) -> Array:
     """Dense matrix (n, n_control) of the basis functions at u: S(u) = N P."""
     first, values = basis_functions(knots, degree, u, derivative)
-    matrix = np.zeros((len(first), len(knots) - degree - 1))
-    matrix[np.arange(len(first))[:, None], first[:, None] + np.arange(degree + 1)] = values[:, derivative]
+    columns = len(knots) - degree - 1
+    if columns == degree + 1:  # a single span: all functions everywhere
+        return np.ascontiguousarray(values[:, derivative])
+    matrix = np.zeros((len(first), columns))
+    begin = first + columns * np.arange(len(first))
+    matrix.reshape(-1)[begin[:, None] + np.arange(degree + 1)] = values[:, derivative]
     return matrix

@@ -84,7 +84,7 @@ def thinned(blocks: Blocks, beams: int = LARGEST, narrow: float = NARROW) -> Blo
 
     Over so short a way even a pillar is flat to less than what the noise leaves of a mean. Scans farther apart stay.
     """
-    if len(blocks.row) < 2:
+    if len(blocks.row) < 2 or np.ptp(blocks.row) < FEWEST_ROWS:
         return blocks
     row, cell = blocks.row - blocks.row.min(), (blocks.column / beams).astype(np.int64)
     cell -= cell.min()

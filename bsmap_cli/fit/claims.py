@@ -21,6 +21,9 @@ FEW_SCANS = 5
 ALIKE = np.radians(2.0)
 """Between the normals of planes that lie alike; from a right angle, those of planes that are square to each other."""
 
+FAR = 0.5
+"""Metres from a plane at which it explains nothing, however far it is continued."""
+
 
 class _Plane(NamedTuple):
     """A flat region over its frame, and its chi square."""
@@ -113,6 +116,9 @@ def _plane(context: Context, members: list[int], scans: int) -> _Plane | None:
 def _explains(context: Context, plane: _Plane, piece: int) -> bool:
     """Whether a plane explains a piece at less than the piece's own price, and is not grazed there."""
     blocks = context.blocks_of([piece])
+    # Most are far off: no need to ask how sure the plane is there.
+    if abs((blocks.points[0] - plane.frame.origin) @ plane.frame.axes[:, 2]) > FAR:
+        return False
     if np.abs(blocks.directions @ plane.frame.axes[:, 2]).mean() < SEED_INCIDENCE:
         return False
     joint = plane.sums.plus(sums_of(plane.frame, blocks, context.sigma))

@@ -87,11 +87,14 @@ def _best_planes(rest: _Rest) -> tuple[IntArray, Array]:
     number = np.pad(rest.number, [(a, a) for a in AROUND], constant_values=-1)
     for first in range(0, len(support), CHUNK):
         own = np.arange(first, min(first + CHUNK, len(support)))
-        window = {
-            step: number[tuple((rest.place[own] + AROUND + step).T)]
-            for step in itertools.product(*(range(-a, a + 1) for a in AROUND))
-        }
-        around = np.stack(list(window.values()))
+        steps = list(itertools.product(*(range(-a, a + 1) for a in AROUND)))
+        around = np.stack([number[tuple((rest.place[own] + AROUND + step).T)] for step in steps])
+        # Those with fewer neighbours than that find no plane to be looked at.
+        enough = np.count_nonzero(around >= 0, axis=0) >= LEAST_SUPPORT
+        own, around = own[enough], around[:, enough]
+        if not len(own):
+            continue
+        window = dict(zip(steps, around, strict=True))
         offsets, directions = rest.points[around] - rest.points[own], rest.directions[around]
         for a, b in itertools.product(ALONG, ACROSS):
             known = np.flatnonzero((window[a] >= 0) & (window[b] >= 0))

@@ -157,11 +157,29 @@ def _least_squares(G: Array) -> Array:
     """Best unknowns (..., k) by Gram matrices (..., k + 1, k + 1) of weighted rows and data; of those that the rows do
     not tell, nearly the least.
     """
+    if G.size == 16:
+        return _three_unknowns(G.reshape(4, 4).tolist()).reshape(*G.shape[:-2], 3)
     A, b = G[..., :-1, :-1], G[..., :-1, -1:]
     scale = 1.0 / np.sqrt(np.maximum(np.einsum("...ii->...i", A), 1e-300))[..., None]
     A = A * scale * np.swapaxes(scale, -1, -2)
     A += UNTOLD * np.eye(A.shape[-1])
     return np.asarray((scale * np.linalg.solve(A, scale * b))[..., 0])
+
+
+def _three_unknowns(G: list[list[float]]) -> Array:
+    """The same for one Gram matrix (4, 4), by plain numbers: called often, and numpy is slow with three."""
+    (aa, ab, ac, ad), (_, bb, bc, bd), (_, _, cc, cd), _ = G
+    p, q, r = (1.0 / math.sqrt(max(of, 1e-300)) for of in (aa, bb, cc))
+    aa, bb, cc = aa * p * p + UNTOLD, bb * q * q + UNTOLD, cc * r * r + UNTOLD
+    ab, ac, bc = ab * p * q, ac * p * r, bc * q * r
+    ad, bd, cd = ad * p, bd * q, cd * r
+    # L D L' with the last unknown first known.
+    f, g = ab / aa, ac / aa
+    bb, bc, bd = bb - f * ab, bc - f * ac, bd - f * ad
+    h = bc / bb
+    z = (cd - g * ad - h * bd) / (cc - g * ac - h * bc)
+    y = bd / bb - h * z
+    return np.array([p * (ad / aa - f * y - g * z), q * y, r * z])
 
 
 def axes_of(normal: Array) -> Array:

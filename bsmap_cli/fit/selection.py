@@ -58,7 +58,7 @@ class Fitted(NamedTuple):
 class _Data(NamedTuple):
     """Feet (n,) of the blocks; heights wanted there and roots of the weights, standard deviations.
 
-    places : along s and t, number of distinct parameters, to a thousandth.
+    square : of all heights wanted.  places : along s and t, number of distinct parameters, to a thousandth.
     least : knots of the least surface.  size : (2,) metres of the rectangle along s and t.
     bases : basis functions at the feet that were computed so far, by direction, degree and knots; along s times `root`.
     """
@@ -66,6 +66,7 @@ class _Data(NamedTuple):
     feet: Met
     wanted: Array
     root: Array
+    square: float
     places: tuple[int, int]
     least: Knots
     size: Array
@@ -180,7 +181,8 @@ def _linearise(field: HeightField, blocks: Blocks, sigma: float, near: _Data | N
     root = root * robust / np.abs(feet.slope)
     places = _places(feet.uv[:, 0]), _places(feet.uv[:, 1])
     least = least_knots(field.base, field.low, field.high)
-    return _Data(feet, wanted * root, root, places, least, field.high - field.low, {})
+    wanted = wanted * root
+    return _Data(feet, wanted, root, float(wanted @ wanted), places, least, field.high - field.low, {})
 
 
 def _places(u: Array) -> int:
@@ -191,8 +193,11 @@ def _places(u: Array) -> int:
 def _normal_equations(knots: Knots, data: _Data) -> tuple[Array, Array]:
     """(k, k) and (k,): products of the basis functions' products with each other, and with the heights wanted."""
     along_s, along_t = data.basis(0, knots.degree_s, knots.s), data.basis(1, knots.degree_t, knots.t)
-    A, b = np.zeros((knots.size, knots.size)), np.zeros(knots.size)
     nt = knots.shape[1]
+    if len(data.root) <= CHUNK and knots.shape[0] < MANY:
+        N = (along_s[:, :, None] * along_t[:, None, :]).reshape(-1, knots.size)
+        return N.T @ N, data.wanted @ N
+    A, b = np.zeros((knots.size, knots.size)), np.zeros(knots.size)
     for rows, own in _parts(knots, data):
         N = (along_s[rows, own, None] * along_t[rows, None, :]).reshape(-1, (own.stop - own.start) * nt)
         there = slice(own.start * nt, own.stop * nt)
@@ -230,8 +235,8 @@ def _solve(knots: Knots, data: _Data) -> _Solution:
     scaled = information * scale[:, None] * scale
     scaled.flat[:: len(A) + 1] += 1e-12
     heights = scale * np.linalg.solve(scaled, scale * b)
-    residuals = _misfit(knots, heights, data)
-    return _Solution(knots, heights, information, float(residuals @ residuals))
+    chi_square = data.square - float(heights @ (2.0 * b - A @ heights))
+    return _Solution(knots, heights, information, max(0.0, chi_square))
 
 
 def smoothness(knots: Knots, size: Array | None = None) -> Array:
@@ -343,12 +348,16 @@ def _raised(line: _Line) -> _Line | None:
 
 def _halved(line: _Line, data: _Data, axis: int, misfit: Array) -> _Line | None:
     """The span with most chi square (n,) over its share halved, if both halves have data."""
-    breaks, u = np.unique(line.knots), np.clip(data.feet.uv[:, axis], 0.0, 1.0)
-    span = np.clip(np.searchsorted(breaks, u, side="right") - 1, 0, len(breaks) - 2)
-    total = np.bincount(span, misfit - 1.0, len(breaks) - 1)
-    worst = int(np.argmax(total))
-    middle = float(breaks[worst] + breaks[worst + 1]) / 2.0
-    inside = u[span == worst]
-    if _places(inside) < 4 or not (inside < middle).any() or not (inside > middle).any():
+    u = np.clip(data.feet.uv[:, axis], 0.0, 1.0)
+    if len(line.knots) == 2 * line.degree + 2:
+        middle, inside, places = 0.5, u, data.places[axis]
+    else:
+        breaks = np.unique(line.knots)
+        span = np.clip(np.searchsorted(breaks, u, side="right") - 1, 0, len(breaks) - 2)
+        worst = int(np.argmax(np.bincount(span, misfit - 1.0, len(breaks) - 1)))
+        middle = float(breaks[worst] + breaks[worst + 1]) / 2.0
+        inside = u[span == worst]
+        places = _places(inside)
+    if places < 4 or not (inside < middle).any() or not (inside > middle).any():
         return None
     return _Line(line.degree, with_knot(line.knots, line.degree, middle))

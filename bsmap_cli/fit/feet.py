@@ -203,13 +203,12 @@ def _newton(table: Table, face: IntArray, p: Array, d: Array, start: Array, step
     # Over a plane s, t and h change evenly along a beam.
     flat, turn = _in_frames(table, face, p, d)
     at, arm = _round_ones(table, face, p.shape[1])
-    every = np.broadcast_to(face, p.shape[1])
-    ahead = turn[:, at]
+    round_ones, ahead = np.broadcast_to(face, p.shape[1])[at] if len(at) else at, turn[:, at]
     beyond = start.copy()
     for step in range(steps):
         local = flat + beyond * turn
         if len(at):
-            local[:, at], c, s = _around(table, every[at], flat[:, at] + beyond[at] * ahead)
+            local[:, at], c, s = _around(table, round_ones, flat[:, at] + beyond[at] * ahead)
             stretch = arm / np.maximum(arm + local[2, at], 0.1 * arm)
             dx, dy, dz = ahead
             turn[:, at] = (dy * c - dx * s) * stretch, dz, dx * c + dy * s
@@ -284,7 +283,10 @@ def _round_ones(table: Table, face: IntArray, count: int) -> tuple[IntArray, Arr
     """Which of the faces (count,), or (1,) for all, are cylinders, and their radii."""
     if not table.radius.any():
         return np.zeros(0, dtype=np.int64), np.zeros(0)
-    radius = np.broadcast_to(table.radius.take(face), count)
+    radius = table.radius.take(face)
+    if len(face) != count:
+        at = np.arange(count if radius[0] else 0)
+        return at, np.full(len(at), radius[0])
     at = np.flatnonzero(radius)
     return at, radius[at]
 
@@ -324,7 +326,7 @@ def _heights(table: Table, face: IntArray, local: Array) -> tuple[Array, Array, 
 def _own_parameter(line: Lines, face: IntArray, u: Array) -> tuple[IntArray, Array, Array]:
     """Number (n,) of the span of each parameter (n,) in its face, the span's own parameter, and its change."""
     number, first = np.zeros(len(u), dtype=np.int64), line.first.take(face)
-    if len(face) != 1 or line.spans[face[0]] > 1:
+    if len(line.begins) > len(line.first) and (len(face) != 1 or line.spans[face[0]] > 1):
         number = line.begins.searchsorted(np.clip(u, 0.0, 1.0) + 2.0 * face, side="right") - 1 - first
     span = number + first
     scale = line.scales.take(span)

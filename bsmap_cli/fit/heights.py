@@ -5,7 +5,7 @@ the model, not of the noisy point. One Gauss-Newton step is a linear least-squar
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -136,9 +136,12 @@ class Knots(NamedTuple):
         return self.shape[0] * self.shape[1]
 
 
+@lru_cache(maxsize=1)
 def flat_knots() -> Knots:
     """The least surface: bilinear, without inner knots."""
-    return Knots(1, 1, open_knots(1), open_knots(1))
+    knots = open_knots(1)
+    knots.flags.writeable = False
+    return Knots(1, 1, knots, knots)
 
 
 def least_knots(base: Base, low: Array, high: Array) -> Knots:

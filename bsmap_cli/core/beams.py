@@ -14,6 +14,8 @@ STEPS = 8
 """Of Newton; from a foot nearby a flat surface takes one or two."""
 MET = 1e-6
 """Metres between surface and beam at which they have met."""
+CHUNK = 8192
+"""Beams whose begins are computed at a time: they fit into the processor's cache."""
 
 
 class Meetings(NamedTuple):
@@ -27,8 +29,13 @@ class Meetings(NamedTuple):
 def beam_origins(cloud: PointCloud, index: IntArray | NDArray[np.intp]) -> Array:
     """(k, 3) begin in map of the beams of points `index` (k,): the laser's place at the time of the beam."""
     by_time = np.argsort(cloud.scan_time_ns, kind="stable")
-    poses = se2.interpolate(cloud.scan_time_ns[by_time], cloud.scan_poses[by_time], cloud.time_ns[index])
-    return np.column_stack([se2.transform(poses, cloud.mount[:2, 3]), np.full(len(index), cloud.mount[2, 3])])
+    time, poses = cloud.scan_time_ns[by_time], cloud.scan_poses[by_time]
+    origins = np.full((len(index), 3), cloud.mount[2, 3])
+    for first in range(0, len(index), CHUNK):
+        part = slice(first, first + CHUNK)
+        at = se2.interpolate(time, poses, cloud.time_ns[index[part]])
+        origins[part, :2] = se2.transform(at, cloud.mount[:2, 3])
+    return origins
 
 
 def cross(surface: Surface, origins: Array, directions: Array, u: Array, v: Array) -> Meetings:

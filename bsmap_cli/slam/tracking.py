@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bsmap_cli.core import se2
-from bsmap_cli.core.table import joined
+from bsmap_cli.core.table import joined, take
 from bsmap_cli.model import Array, IntArray, ScanLog
 from bsmap_cli.params import SlamParams
 from bsmap_cli.slam.matching import (
@@ -30,6 +30,7 @@ from bsmap_cli.slam.motion import (
     constant_velocity,
     odometry_motion,
 )
+from bsmap_cli.slam.moving import Watch
 from bsmap_cli.slam.posegraph import Edges
 from bsmap_cli.slam.segments import scan_batches
 from bsmap_cli.track import Track
@@ -51,7 +52,8 @@ LEAST_SPREAD = np.array([0.02, 0.02, 0.01])
 class Tracking(NamedTuple):
     """poses : (n, 3), of every scan, in the frame of the first.  keys : (k,) scans that became key scans.
 
-    points : of each key scan, in base_link.  edges : from each key scan but the first to an earlier one.
+    points : of each key scan, in base_link, less those that move.
+    edges : from each key scan but the first to an earlier one.
     match_information : (k - 1, 3, 3), what the match alone says of each edge.
     weak : (k,) key scans whose match failed, so that their edge holds no more than the motion prior.
     adrift : (k,) key scans before which nothing tells the motion: no odometry, a jump of it, or a long gap.
@@ -78,7 +80,8 @@ def track_scans(log: ScanLog, range_sigma: float, params: SlamParams, track: Tra
     noise = match_noise(range_sigma)
     scans = _points_of_scans(log, range_sigma)
     key_points.append(next(scans))
-    placed = [key_points[0]]
+    placed, watch = [key_points[0]], Watch(log.horizontal)
+    moves = [watch.add(0, poses[0], placed[0], True)]
     target = make_target(placed[0])
     for k, points in enumerate(scans, 1):
         track("slam: tracking", k + 1, n)
@@ -101,12 +104,16 @@ def track_scans(log: ScanLog, range_sigma: float, params: SlamParams, track: Tra
         keys.append(k)
         key_points.append(points)
         placed = [*placed[-WINDOW:], points.moved(poses[k])]
-        target = make_target(joined([placed[j - len(keys)] for j in _local(inliers)]))
+        if log.odometry is not None and _adrift(log, np.array(keys[-2:]))[1]:
+            watch = Watch(log.horizontal)  # what was seen before may be of another place
+        moves.append(watch.add(k, poses[k], placed[-1], found.inliers >= WEAK))
+        target = make_target(joined([take(placed[j - len(keys)], ~moves[j]) for j in _local(inliers)]))
     weak = np.array(inliers) < WEAK
     match_information = np.array(by_match).reshape(-1, 3, 3)
     information = _edge_information(match_information, np.array(priors).reshape(-1, 3, 3), weak[1:])
     chain = _chain(poses[keys], information, np.array(inliers))
     adrift = _adrift(log, np.array(keys))
+    key_points = [take(points, ~gone) for points, gone in zip(key_points, moves, strict=True)]
     return Tracking(poses, np.array(keys), key_points, chain, match_information, weak, adrift, scale.value, matched)
 
 

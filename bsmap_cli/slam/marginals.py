@@ -14,7 +14,7 @@ from bsmap_cli.slam.posegraph import factorise
 
 MOST_POSES = 300
 """Poses solved for exactly; those between them are interpolated, for neighbours err alike."""
-COLUMNS, LINES = 120, 100
+COLUMNS, LINES = 24, 100
 """Columns solved for and lines looked at at once."""
 
 

@@ -4,7 +4,8 @@ A person who walks along with the robot looks like a place that the robot does n
 contradict that; but beams of earlier and later scans that passed where the person stands do.
 """
 
-from typing import NamedTuple
+import cmath
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from scipy.ndimage import minimum_filter1d
 from scipy.spatial import cKDTree
 
 from bsmap_cli.core import se2
-from bsmap_cli.model import Array, IntArray, LaserScans
+from bsmap_cli.model import Array, LaserScans
 from bsmap_cli.slam.matching import OrientedPoints
 
 VIEWS = 4
@@ -26,20 +27,27 @@ MOST = 0.5
 """Share of a scan's points that move beyond which its pose is doubted instead."""
 
 
-class _View(NamedTuple):
-    """A key scan: its points in map, a spatial index of them, and which of them move.
+class _View:
+    """A key scan: its points (k,) in map, as complex numbers, and which of them move.
 
     through, standing : (k,) of the other key scans, how many saw through each point, and, of those seen through, how
-    many saw one there.  laser : (3,) its pose.  free : (m,), see `free_ranges`.
+    many saw one there.  laser : its place.  turn : the conjugate of its direction.  free : (m,), see `free_ranges`.
     """
 
-    xy: Array
-    tree: cKDTree
-    moves: NDArray[np.bool_]
-    through: IntArray
-    standing: IntArray
-    laser: Array
-    free: Array
+    def __init__(self, xy: Array, laser: Array, free: Array) -> None:
+        self.at = xy[:, 0] + 1j * xy[:, 1]
+        self.laser, self.turn, self.free = complex(laser[0], laser[1]), cmath.exp(-1j * laser[2]), free
+        self.moves = np.zeros(len(xy), bool)
+        self.through, self.standing = np.zeros((2, len(xy)), int)
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Spatial index of the points: few scans need it."""
+        return cKDTree(_xy(self.at))
+
+    def shows(self, at: NDArray[np.complex128]) -> NDArray[np.bool_]:
+        """(n,) whether the nearest point of this scan is at the points (n,), and does not move."""
+        return np.append(~self.moves, False)[self.tree.query(_xy(at), distance_upper_bound=SUPPORT)[1]]
 
 
 class Watch:
@@ -54,34 +62,35 @@ class Watch:
 
         sure : whether the pose is; otherwise nothing is told by it, and nothing of it.
         """
-        count = len(placed.xy)
-        moves = np.zeros(count, bool)
-        if not sure or not count:
-            return moves
+        if not sure or not len(placed.xy):
+            return np.zeros(len(placed.xy), bool)
         free = free_ranges(self._scans.ranges[scan], self._scans.angle_increment)
-        laser = se2.compose(pose, self._mount)
-        view = _View(placed.xy, cKDTree(placed.xy), moves, np.zeros(count, int), np.zeros(count, int), laser, free)
-        for other in self._views:
-            self._compare(view, other)
-            self._compare(other, view)
-        self._follow(view)
+        view = _View(placed.xy, se2.compose(pose, self._mount), free)
+        if self._views:
+            self._look_at(view)
+            self._follow(view)
         self._views = [*self._views[1 - VIEWS :], view]
-        return moves
+        return view.moves
 
-    def _compare(self, view: _View, other: _View) -> None:
-        """Which points of `view` another scan sees through, and which of these it sees: they move unless more see them.
+    def _look_at(self, view: _View) -> None:
+        """What the new scan and the others see through of each other."""
+        border = np.cumsum([len(other.at) for other in self._views[:-1]])
+        through = np.split(self._seen_through(np.concatenate([other.at for other in self._views]), view), border)
+        for other, back in zip(self._views, through, strict=True):
+            self._count(view, other, self._seen_through(view.at, other))
+            self._count(other, view, back)
+
+    def _count(self, view: _View, other: _View, through: NDArray[np.bool_]) -> None:
+        """Points of `view` that the other scan sees `through` move, unless more others see one there.
 
         What shows from one side only (a table's edge, glass) is seen through too, but stands where it was seen.
         """
-        through = self._seen_through(view.xy, other)
-        if through.mean() > MOST:
+        if np.count_nonzero(through) > MOST * len(through):
             return
-        view.through[through] += 1
+        view.through += through
         doubted = np.flatnonzero(view.through)
         if len(doubted):
-            nearest = other.tree.query(view.xy[doubted], distance_upper_bound=SUPPORT)[1]
-            stands = np.append(~other.moves, False)[nearest]
-            view.standing[doubted[stands]] += 1
+            view.standing[doubted] += other.shows(view.at[doubted])
             view.moves[doubted] = view.through[doubted] >= view.standing[doubted]
 
     def _follow(self, view: _View) -> None:
@@ -89,27 +98,34 @@ class Watch:
 
         Whoever walks ahead is seen through by later scans alone.
         """
-        before = self._views[-1:]
-        gone = [other.xy[other.moves & (other.through > 0)] for other in before]
-        if not gone or not len(gone[0]):
+        last = self._views[-1]
+        gone = last.at[last.moves & (last.through > 0)]
+        standing = np.concatenate([other.at[~other.moves] for other in self._views])
+        if not len(gone) or not len(standing):
             return
-        near = np.flatnonzero(np.isfinite(cKDTree(gone[0]).query(view.xy, distance_upper_bound=STRIDE)[0]))
-        standing = np.concatenate([other.xy[~other.moves] for other in self._views])
-        if len(near) and len(standing):
-            alone = ~np.isfinite(cKDTree(standing).query(view.xy[near], distance_upper_bound=SUPPORT)[0])
-            view.moves[near[alone]] = True
+        near = np.flatnonzero(_near(view.at, cKDTree(_xy(gone)), STRIDE))
+        view.moves[near[~_near(view.at[near], cKDTree(_xy(standing)), SUPPORT)]] = True
 
-    def _seen_through(self, xy: Array, view: _View) -> NDArray[np.bool_]:
-        """(n,) whether points (n, 2) in map lie where beams of a scan passed."""
-        x, y = xy[:, 0] - view.laser[0], xy[:, 1] - view.laser[1]
-        beam = se2.wrap(np.arctan2(y, x) - view.laser[2] - self._scans.angle_min) / self._scans.angle_increment
-        turn = 2 * np.pi / abs(self._scans.angle_increment)
-        beam = np.rint(np.where(beam < -0.5, beam + turn, beam)).astype(int)
-        inside = beam < len(view.free)
-        return inside & (np.hypot(x, y) < view.free[np.where(inside, beam, 0)])
+    def _seen_through(self, at: NDArray[np.complex128], view: _View) -> NDArray[np.bool_]:
+        """(n,) whether points (n,) in map, as complex numbers, lie where beams of a scan passed."""
+        away = (at - view.laser) * view.turn
+        increment = self._scans.angle_increment
+        beam = np.rint((np.angle(away) - self._scans.angle_min) / increment).astype(int)
+        beam[beam < 0] += round(2 * np.pi / abs(increment))
+        # Beyond the last beam there is nothing free.
+        return np.abs(away) < np.append(view.free, -np.inf)[np.minimum(beam, len(view.free))]
 
 
 def free_ranges(ranges: NDArray[np.float32], increment: float) -> Array:
     """(m,) metres along each beam, and beside it, where there was nothing for sure; 0 where nothing returned."""
     aside = int(np.ceil(ASIDE / abs(increment)))
     return np.asarray(minimum_filter1d(np.nan_to_num(ranges), 2 * aside + 1), dtype=np.float64) - SHORT
+
+
+def _xy(at: NDArray[np.complex128]) -> Array:
+    return np.column_stack([at.real, at.imag])
+
+
+def _near(at: NDArray[np.complex128], tree: cKDTree, reach: float) -> NDArray[np.bool_]:
+    """(n,) whether points (n,) have one of the tree within reach."""
+    return np.isfinite(tree.query(_xy(at), distance_upper_bound=reach)[0])

@@ -20,7 +20,7 @@ from bsmap_cli.slam.scatter import weighed
 from bsmap_cli.slam.segments import Segments
 from bsmap_cli.slam.sightings import Sightings, extents_and_hits, match_all, sighting_term, with_rivals
 
-ITERATIONS, HONEST_ITERATIONS = (3, 3, 5), 5
+ITERATIONS, HONEST_ITERATIONS = (2, 2, 4), 4
 """Steps of Gauss-Newton after each matching of segments to lines; of the variances at the poses found."""
 CONVERGED, SETTLED = 1e-4, 0.01
 """Metres and radians: poses that move less are found; relative change of the variances' scales at which these are."""

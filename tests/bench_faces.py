@@ -221,7 +221,7 @@ def main(seeds):
         show(f"{scans} x {beams}, 10 mm", [measure(place, np.arange(scans)) for place in places])
     simulated_rows("room", max(1, seeds // 3))
     simulated_rows("corridor", max(1, seeds // 5))
-    simulated_rows("loop", 1)
+    simulated_rows("loop", max(1, seeds // 3))
     curved_rows(max(1, seeds // 3))
     real()
 

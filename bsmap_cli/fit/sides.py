@@ -18,27 +18,32 @@ def on_their_sides(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightFiel
     """Labels, the last beams of runs before another face given to that one where they lie beyond the crease.
 
     Which of two surfaces is nearer along a beam, the noise does not touch: on the other side of their crease it is the
-    other one. Where that one does not explain the beam, the two do not meet there, and it stays.
+    other one. Where the two do not cross between the runs, or that one does not explain the beam, they do not meet
+    there, and it stays.
     """
     table, labels = tabulate(fields), labels.copy()
     (row, start, stop, label), near = _joined(runs_of(labels))
+    half = np.minimum((stop - start) // 2, 2 * BEYOND)
     for own, other, step in ((near, near + 1, -1), (near + 1, near, 1)):
-        first = stop[own] - 1 if step < 0 else start[own]
-        half = np.minimum((stop[own] - start[own]) // 2, 2 * BEYOND)
-        # The last one, inside the run, tells which surface is nearer there.
-        at = first[:, None] + step * np.append(np.broadcast_to(np.arange(BEYOND), (len(own), BEYOND)), half[:, None], 1)
+        end, begin = (stop[own] - 1, start[other]) if step < 0 else (start[own], stop[other] - 1)
+        # The last two, inside of both runs, tell which surface is nearer on either side.
+        at = np.column_stack(
+            [end[:, None] + step * np.arange(BEYOND), end + step * half[own], begin - step * half[other]]
+        )
         at = np.clip(at, 0, labels.shape[1] - 1)
         r = np.broadcast_to(row[own, None], at.shape)
-        k, i = np.nonzero((np.arange(BEYOND + 1) < half[:, None]) | (np.arange(BEYOND + 1) == BEYOND))
+        k, i = np.nonzero((np.arange(BEYOND + 2) < half[own, None]) | (np.arange(BEYOND + 2) >= BEYOND))
         seen = grid.hit[r[k, i], at[k, i]]
         k, i = k[seen], i[seen]
         to_own, to_other = np.full((2, *at.shape), np.nan)
         for way, face in ((to_own, label[own]), (to_other, label[other])):
             way[k, i] = met_at(grid, table, face[k], r[k, i], at[k, i]).beyond
         sign = np.sign(to_own - to_other)
+        inner, across = sign[:, BEYOND, None], sign[:, BEYOND + 1, None]
+        sign = sign[:, :BEYOND]
         # From the end of the run on as far as beams of the rest allow.
-        wrong = np.logical_and.accumulate((sign[:, :-1] * sign[:, -1:] < 0.0) | np.isnan(sign[:, :-1]), axis=1)
-        wrong &= labels[r[:, :-1], at[:, :-1]] == label[own, None]
+        wrong = np.logical_and.accumulate((sign * inner < 0.0) | np.isnan(sign), axis=1) & (across * inner < 0.0)
+        wrong &= labels[r[:, :BEYOND], at[:, :BEYOND]] == label[own, None]
         k, i = np.nonzero(wrong)
         explained = np.abs(to_other[k, i]) < OUTLIER * sigma
         k, i = k[explained], i[explained]

@@ -6,15 +6,7 @@ import numpy as np
 
 from bsmap_cli.core import se2
 from bsmap_cli.core.table import joined, take
-from bsmap_cli.model import (
-    IntArray,
-    LineMap,
-    LoopClosures,
-    ScanLog,
-    SlamMap,
-    StepStatistics,
-    Trajectory,
-)
+from bsmap_cli.model import IntArray, LineMap, LoopClosures, ScanLog, SlamMap, StepStatistics, Trajectory
 from bsmap_cli.params import SlamParams
 from bsmap_cli.slam.between import evenly, every_scan
 from bsmap_cli.slam.latency import lined_up, odometry_delay

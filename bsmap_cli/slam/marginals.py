@@ -12,7 +12,7 @@ from bsmap_cli.core.modes import LEAST_SHARE, LEVER, MOST_MODES, largest_positiv
 from bsmap_cli.model import Array, IntArray
 from bsmap_cli.slam.posegraph import factorise
 
-MOST_POSES = 300
+MOST_POSES = 200
 """Poses solved for exactly; those between them are interpolated, for neighbours err alike."""
 COLUMNS, LINES = 24, 100
 """Columns solved for and lines looked at at once."""

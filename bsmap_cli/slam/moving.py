@@ -9,7 +9,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import minimum_filter1d
 from scipy.spatial import cKDTree
 
 from bsmap_cli.core import se2
@@ -31,7 +30,7 @@ class _View:
     """A key scan: its points (k,) in map, as complex numbers, and which of them move.
 
     through, standing : (k,) of the other key scans, how many saw through each point, and, of those seen through, how
-    many saw one there.  laser : its place.  turn : the conjugate of its direction.  free : (m,), see `free_ranges`.
+    many saw one there.  laser : its place.  turn : the conjugate of its direction.  free : (m + 1,), see `free_ranges`.
     """
 
     def __init__(self, xy: Array, laser: Array, free: Array) -> None:
@@ -75,9 +74,10 @@ class Watch:
     def _look_at(self, view: _View) -> None:
         """What the new scan and the others see through of each other."""
         border = np.cumsum([len(other.at) for other in self._views[:-1]])
-        through = np.split(self._seen_through(np.concatenate([other.at for other in self._views]), view), border)
-        for other, back in zip(self._views, through, strict=True):
-            self._count(view, other, self._seen_through(view.at, other))
+        through = self._seen_through(np.concatenate([other.at for other in self._views]), [view])[0]
+        ahead = self._seen_through(view.at, self._views)
+        for other, there, back in zip(self._views, ahead, np.split(through, border), strict=True):
+            self._count(view, other, there)
             self._count(other, view, back)
 
     def _count(self, view: _View, other: _View, through: NDArray[np.bool_]) -> None:
@@ -106,20 +106,29 @@ class Watch:
         near = np.flatnonzero(_near(view.at, cKDTree(_xy(gone)), STRIDE))
         view.moves[near[~_near(view.at[near], cKDTree(_xy(standing)), SUPPORT)]] = True
 
-    def _seen_through(self, at: NDArray[np.complex128], view: _View) -> NDArray[np.bool_]:
-        """(n,) whether points (n,) in map, as complex numbers, lie where beams of a scan passed."""
-        away = (at - view.laser) * view.turn
+    def _seen_through(self, at: NDArray[np.complex128], views: list[_View]) -> NDArray[np.bool_]:
+        """(v, n) whether points (n,) in map, as complex numbers, lie where beams of the scans passed."""
+        laser, turn = np.array([[view.laser, view.turn] for view in views]).T[..., None]
+        away = (at - laser) * turn
         increment = self._scans.angle_increment
         beam = np.rint((np.angle(away) - self._scans.angle_min) / increment).astype(int)
         beam[beam < 0] += round(2 * np.pi / abs(increment))
-        # Beyond the last beam there is nothing free.
-        return np.abs(away) < np.append(view.free, -np.inf)[np.minimum(beam, len(view.free))]
+        free = np.array([view.free for view in views])
+        return np.abs(away) < np.take_along_axis(free, np.minimum(beam, free.shape[1] - 1), axis=1)
 
 
 def free_ranges(ranges: NDArray[np.float32], increment: float) -> Array:
-    """(m,) metres along each beam, and beside it, where there was nothing for sure; 0 where nothing returned."""
+    """(m + 1,) metres along each beam, and beside it, where there was nothing for sure; none where nothing returned.
+
+    The last one stands for all directions without a beam.
+    """
     aside = int(np.ceil(ASIDE / abs(increment)))
-    return np.asarray(minimum_filter1d(np.nan_to_num(ranges), 2 * aside + 1), dtype=np.float64) - SHORT
+    known = np.nan_to_num(np.append(ranges, 0.0))
+    least = known.copy()
+    for step in range(1, aside + 1):
+        for some, other in ((slice(step, None), slice(None, -step)), (slice(None, -step), slice(step, None))):
+            np.minimum(least[some], known[other], out=least[some])
+    return least - SHORT
 
 
 def _xy(at: NDArray[np.complex128]) -> Array:

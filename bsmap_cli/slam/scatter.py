@@ -116,8 +116,10 @@ def by_parts(squares: Array, left: Array, parts: Array) -> Array:
         now = np.tensordot(scales, parts, axes=1)
         distance = squares / (now * left)
         distance *= left / (1.0 + distance / ROBUST_WIDTH)
-        shares = (parts * left / now).reshape(len(parts), -1)
-        scales = nnls(shares.T, distance.ravel() / robust_means(1).distance)[0]
+        shares = (parts * (left / now)).reshape(len(parts), -1)
+        # The same as by all rows: only their products count.
+        root = np.linalg.cholesky(shares @ shares.T + np.diag(np.full(len(parts), 1e-9)))
+        scales = nnls(root.T, np.linalg.solve(root, shares @ distance.ravel() / robust_means(1).distance))[0]
         scales[0] = max(scales[0], LEAST_NOISE)
         scales[2] = max(scales[2], LEAST_FLOOR * max(1.0, scales[0]))
     return scales

@@ -82,6 +82,7 @@ def track_scans(log: ScanLog, range_sigma: float, params: SlamParams, track: Tra
     key_points.append(next(scans))
     placed, watch = [key_points[0]], Watch(log.horizontal)
     moves = [watch.add(0, poses[0], placed[0], True)]
+    broken = _adrift(log, np.arange(n)) if log.odometry is not None else np.zeros(n, bool)
     target = make_target(placed[0])
     for k, points in enumerate(scans, 1):
         track("slam: tracking", k + 1, n)
@@ -104,7 +105,7 @@ def track_scans(log: ScanLog, range_sigma: float, params: SlamParams, track: Tra
         keys.append(k)
         key_points.append(points)
         placed = [*placed[-WINDOW:], points.moved(poses[k])]
-        if log.odometry is not None and _adrift(log, np.array(keys[-2:]))[1]:
+        if broken[keys[-2] + 1 : k + 1].any():
             watch = Watch(log.horizontal)  # what was seen before may be of another place
         moves.append(watch.add(k, poses[k], placed[-1], found.inliers >= WEAK))
         target = make_target(joined([take(placed[j - len(keys)], ~moves[j]) for j in _local(inliers)]))

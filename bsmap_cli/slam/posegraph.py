@@ -168,7 +168,7 @@ def optimise(poses: Array, edges: Edges) -> Solution:
         step = factorise(matrix[3:, 3:]).solve(side[3:]).reshape(-1, 3)
         poses[1:] += step
         poses[:, 2] = se2.wrap(poses[:, 2])
-        if np.abs(step).max(initial=0.0) < 1e-5:
+        if np.abs(step).max(initial=0.0) < 1e-4:
             break
     distance, _ = weighted(edges, residuals(poses, edges)[0])
     return Solution(poses, distance)

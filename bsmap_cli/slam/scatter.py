@@ -26,7 +26,7 @@ LEAST_NOISE = LEAST_FLOOR = 0.02
 shows it."""
 LEAST_LEFT = 0.05
 """Share of a variance that an error must still have, however much was fitted to it."""
-ROUNDS, STEPS, PROBES = 3, 5, 16
+ROUNDS, STEPS, PROBES = 3, 5, 8
 """Of all lines' scales and single lines' in turn; of either in itself; random vectors for the diagonal of an inverse.
 """
 

@@ -26,7 +26,7 @@ CONVERGED, SETTLED = 1e-4, 0.01
 """Metres and radians: poses that move less are found; relative change of the variances' scales at which these are."""
 POSE_SPREAD = (0.05, 0.015)
 """Metres and radians by which a key pose may be off when segments are matched to lines for the first time."""
-PROBES = 16
+PROBES = 8
 LEAST_SCALE, MOST_SCALE = 0.02, 50.0
 """Random vectors for the trace of a large inverse; limits of what the errors' variances may be off by in one step."""
 LEAST_ODOMETRY_SCALE, LEAST_STEP_SCALE = 0.04, 0.05

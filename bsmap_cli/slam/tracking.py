@@ -108,14 +108,18 @@ def track_scans(log: ScanLog, range_sigma: float, params: SlamParams, track: Tra
         if broken[keys[-2] + 1 : k + 1].any():
             watch = Watch(log.horizontal)  # what was seen before may be of another place
         moves.append(watch.add(k, poses[k], placed[-1], found.inliers >= WEAK))
-        target = make_target(joined([take(placed[j - len(keys)], ~moves[j]) for j in _local(inliers)]))
+        target = make_target(joined([_standing(placed[j - len(keys)], moves[j]) for j in _local(inliers)]))
     weak = np.array(inliers) < WEAK
     match_information = np.array(by_match).reshape(-1, 3, 3)
     information = _edge_information(match_information, np.array(priors).reshape(-1, 3, 3), weak[1:])
     chain = _chain(poses[keys], information, np.array(inliers))
     adrift = _adrift(log, np.array(keys))
-    key_points = [take(points, ~gone) for points, gone in zip(key_points, moves, strict=True)]
+    key_points = [_standing(*both) for both in zip(key_points, moves, strict=True)]
     return Tracking(poses, np.array(keys), key_points, chain, match_information, weak, adrift, scale.value, matched)
+
+
+def _standing(points: OrientedPoints, moves: NDArray[np.bool_]) -> OrientedPoints:
+    return take(points, ~moves) if moves.any() else points
 
 
 def _adrift(log: ScanLog, keys: IntArray) -> NDArray[np.bool_]:

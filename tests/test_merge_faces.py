@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+import shapely
 from face_maps import SIGMA, bow, bowed, floor, map_of, wall, with_crease
 from face_scenes import simulated_place
 from scenes import simulated
@@ -19,7 +20,7 @@ from bsmap_cli.fit import fit_surfaces
 from bsmap_cli.io.surfaces_json import read_surfaces, write_surfaces
 from bsmap_cli.merge import merge_surfaces
 from bsmap_cli.merge.bases import based_face
-from bsmap_cli.merge.regions import region_of, united
+from bsmap_cli.merge.regions import region_of, united, without_mitres
 from bsmap_cli.model import SurfaceMap
 from bsmap_cli.params import CloudParams, FitParams, MergeParams, SlamParams
 from bsmap_cli.slam import run_slam
@@ -331,3 +332,14 @@ def test_joined_face_does_not_swing_between_what_planes_tell_of_it():
     at = np.stack(np.meshgrid(np.linspace(0.0, 1.0, 201), [0.1, 0.5, 0.9], indexing="ij"), axis=-1).reshape(-1, 2)
     for surface in result.surfaces:
         assert np.abs(evaluate_surface(surface, *at.T)[:, 1]).max() < 0.005
+
+
+def test_slit_whose_sides_coincide_to_the_grid_is_cut_to_what_touches():
+    """A fast clip of the regions to the gap's box raises there."""
+    outline = [(-0.65343, -1.61574), (-0.6616, -1.63745), (-0.6534, -1.61575), (-0.36, -1.75), (-0.36, -2.2)]
+    slit = [(-0.4, -2.3), (-0.84751, -2.13029), (-0.6616, -1.63746), (-0.84761, -2.13049)]
+    whole = shapely.Polygon([*outline, *slit, (-1.15, -2.02), (-1.15, -1.6), (-1.05, -1.44)])
+    part = shapely.Polygon([(-0.6616, -1.63746), (-0.84751, -2.13029), (-0.81014, -2.14446), (-0.84755, -2.13032)])
+    found = without_mitres(part, whole)
+    assert found.is_valid
+    assert found.area == pytest.approx(part.area, abs=1e-5)

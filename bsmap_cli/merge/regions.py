@@ -50,16 +50,16 @@ def united(regions: Sequence[Region], gap: float, creases: Array = NO_SIDES) -> 
         holes = shapely.union_all([shapely.difference(filled(region), region) for region in regions])
         added = shapely.difference(shapely.difference(closed, whole), holes)
         lines = shapely.STRtree(list(shapely.linestrings(creases)))
-        filled_in = (inner for part in parts(added) for inner in parts(_without_spikes(part, whole)))
+        filled_in = (inner for part in parts(added) for inner in parts(without_mitres(part, whole)))
         between = [part for part in filled_in if _touched(part, regions) > 1 and not _between(part, lines)]
         whole = shapely.union_all([whole, *between], grid_size=GRID)
     return without_specks(whole)
 
 
-def _without_spikes(part: Region, whole: Region) -> Region:
+def without_mitres(part: Region, whole: Region) -> Region:
     """What of a gap lies between places where it touches the regions: mitres of ragged outlines stand out farther."""
     low_s, low_t, high_s, high_t = part.bounds
-    near = shapely.clip_by_rect(whole, low_s - GRID, low_t - GRID, high_s + GRID, high_t + GRID)
+    near = shapely.intersection(whole, shapely.box(low_s - GRID, low_t - GRID, high_s + GRID, high_t + GRID))
     touched = shapely.intersection(part, shapely.buffer(near, 2.0 * GRID))
     return shapely.intersection(part, shapely.convex_hull(touched), grid_size=GRID)
 

@@ -18,6 +18,7 @@ from bsmap_cli.fit.labels import (
     Misses,
     Runs,
     adopt,
+    enclosed,
     fill,
     find_misses,
     move_breaks,
@@ -103,7 +104,8 @@ def find_faces(grid: BeamGrid) -> Faces:
         points = grid.points[(labels == number) & grid.hit]
         if len(points) < LEAST_BLOCKS * one.field.knots.size or _stands_on_edge(one.field, points):
             labels[labels == number] = -1
-    labels, kept = _kept(on_their_sides(grid, labels, [one.field for one in fitted], sigma), grid)
+    labels = enclosed(grid, on_their_sides(grid, labels, [one.field for one in fitted], sigma))
+    labels, kept = _kept(labels, grid)
     return Faces(labels, [fitted[k] for k in kept], sigma)
 
 

@@ -14,8 +14,20 @@ from bsmap_cli.errors import BsmapError
 from bsmap_cli.model import Array, IntArray
 
 ITERATIONS = 30
+PROBES, MOST_NUMBERS = (8, 64), 60000
+"""Random vectors at least and at most; numbers in all of them beyond which there are fewer."""
 ROBUST_WIDTH = 9.0
 """Squared Mahalanobis distance at which the weight of a robust edge has fallen to one half (Cauchy)."""
+
+
+def probes(rows: int, unknowns: int) -> Array:
+    """(rows, k) random signs for the trace or the diagonal of what the inverse of a matrix of `unknowns` makes.
+
+    The fewer unknowns, the less they cost and the more are needed; the seed is fixed, so that the same data give the
+    same numbers.
+    """
+    count = int(np.clip(MOST_NUMBERS // max(unknowns, 1), *PROBES))
+    return np.random.default_rng(0).choice([-1.0, 1.0], size=(rows, count))
 
 
 class Edges(NamedTuple):

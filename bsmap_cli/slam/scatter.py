@@ -11,7 +11,7 @@ from scipy.optimize import nnls
 from scipy.sparse.linalg import SuperLU
 
 from bsmap_cli.model import Array, IntArray
-from bsmap_cli.slam.posegraph import ROBUST_WIDTH, entries, robust_means
+from bsmap_cli.slam.posegraph import ROBUST_WIDTH, entries, probes, robust_means
 from bsmap_cli.slam.segments import Segments
 from bsmap_cli.slam.sightings import Sightings, derivatives, errors
 
@@ -26,9 +26,8 @@ LEAST_NOISE = LEAST_FLOOR = 0.02
 shows it."""
 LEAST_LEFT = 0.05
 """Share of a variance that an error must still have, however much was fitted to it."""
-ROUNDS, STEPS, PROBES = 3, 5, 8
-"""Of all lines' scales and single lines' in turn; of either in itself; random vectors for the diagonal of an inverse.
-"""
+ROUNDS, STEPS = 3, 5
+"""Of all lines' scales and single lines' in turn; of either in itself."""
 
 
 def weighed(
@@ -85,7 +84,7 @@ def left_over(poses: Array, lines: Array, sightings: Sightings, centre: Array, f
     """(m, 2) share of its variance that each error still has: one less its leverage, for poses and lines were fitted.
 
     The diagonal of A N^-1 A' by random vectors of signs (Bekas, Kokiopoulou and Saad 2007), over the variances that
-    made N; the seed is fixed, so that the same data give the same shares.
+    made N.
     """
     by_pose, by_line = derivatives(poses, lines, sightings)
     for part in (by_pose, by_line):
@@ -98,7 +97,7 @@ def left_over(poses: Array, lines: Array, sightings: Sightings, centre: Array, f
     variances = centred(np.asarray(np.linalg.inv(sightings.information), dtype=np.float64))[1]
     # Each in units of its deviation, so that those of large variances do not drown the others.
     deviation = np.sqrt(variances).reshape(-1, 1)
-    signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(shape[0], PROBES))
+    signs = probes(*shape)
     fitted = (A @ factors.solve(A.T @ (signs / deviation)) * signs / deviation).mean(axis=1).reshape(-1, 2)
     # Robust weights made N smaller by their mean.
     return np.clip(1.0 - robust_means(2).weight * fitted, LEAST_LEFT, 1.0)

@@ -26,9 +26,8 @@ CONVERGED, SETTLED = 1e-4, 0.01
 """Metres and radians: poses that move less are found; relative change of the variances' scales at which these are."""
 POSE_SPREAD = (0.05, 0.015)
 """Metres and radians by which a key pose may be off when segments are matched to lines for the first time."""
-PROBES = 8
 LEAST_SCALE, MOST_SCALE = 0.02, 50.0
-"""Random vectors for the trace of a large inverse; limits of what the errors' variances may be off by in one step."""
+"""Limits of what the errors' variances may be off by in one step."""
 LEAST_ODOMETRY_SCALE, LEAST_STEP_SCALE = 0.04, 0.05
 """Least scales of the variances of odometry and of steps as they were tracked. Where hardly anything contradicts the
 steps, as along a bare corridor, they would otherwise seem exact, and lines could no longer correct them."""
@@ -176,16 +175,16 @@ def _variance_components(problem: _Problem, poses: Array, lines: Array, factors:
     """(2,) by how much the variances of steps and closures are too small (Foerstner 1979): residuals over redundancy.
 
     The redundancy of a part is its number of observations less the trace of N^-1 N_part, which random vectors of signs
-    estimate (Hutchinson 1990); the seed is fixed, so that the same data give the same scales.
+    estimate (Hutchinson 1990).
     """
     size = 3 * len(poses) + 2 * len(lines)
-    probes = np.random.default_rng(0).choice([-1.0, 1.0], size=(size - 3, PROBES))
-    solved = factors.solve(probes)
+    signs = posegraph.probes(size - 3, size)
+    solved = factors.solve(signs)
     scales = np.ones(2)
     for k, part in enumerate((problem.steps, problem.closures)):
         term = posegraph.edge_term(poses, part)
         matrix = posegraph.term_matrix(term, size)[3:, 3:]
-        redundancy = term.observations - float(np.einsum("ik,ik->", solved, matrix @ probes)) / PROBES
+        redundancy = term.observations - float(np.einsum("ik,ik->", solved, matrix @ signs)) / signs.shape[1]
         # Without much left over, a part tells nothing of its own errors.
         if redundancy > max(10.0, 0.05 * term.observations):
             scales[k] = np.clip(term.distance / (term.share * redundancy), LEAST_SCALE, MOST_SCALE)

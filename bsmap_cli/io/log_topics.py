@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,28 +20,23 @@ logger = logging.getLogger("bsmap")
 
 @dataclass
 class ScanTopic:
-    """Scans of one laser as they came. `geometry` holds angle_min, angle_increment, time_increment, range limits.
-
-    `alike`: what the last one has in common with others, where these need not be decoded as a whole.
-    """
+    """Scans of one laser as they came. `geometry` holds angle_min, angle_increment, time_increment, range limits."""
 
     frame_id: str
     time_ns: list[int] = field(default_factory=list)
     log_time: list[int] = field(default_factory=list)
     ranges: list[NDArray[np.float32]] = field(default_factory=list)
     geometry: list[tuple[float, float, float, float, float]] = field(default_factory=list)
-    alike: ros.Alike | None = None
 
 
 @dataclass
 class OdometryTopic:
-    """Odometry as it came: `poses` are x, y, yaw of the child frame; `alike` as for scans."""
+    """Odometry as it came: `poses` are x, y, yaw of the child frame."""
 
     child_frame_id: str
     time_ns: list[int] = field(default_factory=list)
     log_time: list[int] = field(default_factory=list)
     poses: list[tuple[float, float, float]] = field(default_factory=list)
-    alike: ros.Alike | None = None
 
 
 @dataclass
@@ -78,7 +74,7 @@ def read_topics(path: Path | str) -> LogTopics:
         if take is None:
             continue
         try:
-            take(topics, message)
+            take(topics, message, ros.decode(message.data, message.type_name))
         except Exception as error:  # rosbags raises whatever the damaged bytes lead it to
             broken[f"{message.topic} ({type(error).__name__}: {error})"] += 1
     if broken:
@@ -87,39 +83,23 @@ def read_topics(path: Path | str) -> LogTopics:
     return topics
 
 
-def _take_scan(topics: LogTopics, message: McapMessage) -> None:
-    topic, data = topics.scans.get(message.topic), message.data
-    if topic is not None and topic.alike is not None and topic.alike.fits(data):
-        topic.ranges.append(ros.ranges_at(data, topic.alike.start, len(topic.ranges[-1])))
-        topic.geometry.append(topic.geometry[-1])
-        topic.time_ns.append(ros.stamp_at(data))
-    else:
-        scan = ros.decode(data, message.type_name)
-        topic = topics.scans.setdefault(message.topic, ScanTopic(scan.header.frame_id.lstrip("/")))
-        geometry = (scan.angle_min, scan.angle_increment, scan.time_increment, scan.range_min, scan.range_max)
-        topic.ranges.append(scan.ranges)
-        topic.geometry.append(geometry)
-        topic.time_ns.append(ros.time_of(scan))
-        topic.alike = ros.alike_scans(data, scan)
+def _take_scan(topics: LogTopics, message: McapMessage, scan: Any) -> None:
+    topic = topics.scans.setdefault(message.topic, ScanTopic(scan.header.frame_id.lstrip("/")))
+    topic.time_ns.append(ros.time_of(scan))
     topic.log_time.append(message.log_time)
+    topic.ranges.append(scan.ranges)
+    geometry = (scan.angle_min, scan.angle_increment, scan.time_increment, scan.range_min, scan.range_max)
+    topic.geometry.append(geometry)
 
 
-def _take_odometry(topics: LogTopics, message: McapMessage) -> None:
-    topic, data = topics.odometry.get(message.topic), message.data
-    if topic is not None and topic.alike is not None and topic.alike.fits(data):
-        topic.poses.append(ros.pose_at(data, topic.alike.start))
-        topic.time_ns.append(ros.stamp_at(data))
-    else:
-        odometry = ros.decode(data, message.type_name)
-        topic = topics.odometry.setdefault(message.topic, OdometryTopic(odometry.child_frame_id.lstrip("/")))
-        topic.poses.append(ros.planar_pose(odometry.pose.pose))
-        topic.time_ns.append(ros.time_of(odometry))
-        topic.alike = ros.alike_odometry(data, odometry)
+def _take_odometry(topics: LogTopics, message: McapMessage, odometry: Any) -> None:
+    topic = topics.odometry.setdefault(message.topic, OdometryTopic(odometry.child_frame_id.lstrip("/")))
+    topic.time_ns.append(ros.time_of(odometry))
     topic.log_time.append(message.log_time)
+    topic.poses.append(ros.planar_pose(odometry.pose.pose))
 
 
-def _take_transforms(topics: LogTopics, message: McapMessage) -> None:
-    tf = ros.decode(message.data, message.type_name)
+def _take_transforms(topics: LogTopics, message: McapMessage, tf: Any) -> None:
     tree = topics.transforms if message.topic.endswith("tf_static") else topics.moving
     for transform in tf.transforms:
         child = transform.child_frame_id.lstrip("/")
@@ -127,7 +107,7 @@ def _take_transforms(topics: LogTopics, message: McapMessage) -> None:
             tree[child] = transform.header.frame_id.lstrip("/"), ros.matrix_of(transform.transform)
 
 
-_TAKERS: dict[str, Callable[[LogTopics, McapMessage], None]] = {
+_TAKERS: dict[str, Callable[[LogTopics, McapMessage, Any], None]] = {
     ros.LASER_SCAN: _take_scan,
     ros.ODOMETRY: _take_odometry,
     ros.TF_MESSAGE: _take_transforms,

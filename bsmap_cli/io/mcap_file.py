@@ -8,16 +8,13 @@ import logging
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
-from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import zstandard
-from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError
-from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Message, Schema
-from mcap.stream_reader import StreamReader, get_chunk_data_stream
+from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
 from bsmap_cli import __version__
@@ -30,7 +27,6 @@ logger = logging.getLogger("bsmap")
 
 # What damage looks like to the mcap package; its CRCValidationError is a ValueError.
 _DAMAGE = (McapError, ValueError, KeyError, IndexError, OverflowError, MemoryError, struct.error, zstandard.ZstdError)
-_RECORD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<HIQQ")
 _CHUNK_BYTES = 256 * 1024  # small, for damage costs a chunk
 # For `ros2 bag play`: late subscribers get /tf_static too.
 _LATCHED_QOS = "- {history: 1, depth: 1, reliability: 1, durability: 1}\n"
@@ -100,7 +96,7 @@ def _sound_records(path: Path, damage: list[str]) -> Iterator[Any]:
         while True:
             try:
                 record = next(records)
-                parts = _unpacked(record) if isinstance(record, Chunk) else [record]
+                parts = breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]
             except StopIteration:
                 return
             except _DAMAGE as error:
@@ -109,27 +105,6 @@ def _sound_records(path: Path, damage: list[str]) -> Iterator[Any]:
                 damage[0] = damage[0] or what
             else:
                 yield from parts
-
-
-def _unpacked(chunk: Chunk) -> list[Any]:
-    """Records of a chunk; its messages read at once, which takes a third of the time that field by field does."""
-    stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-    data, at, records = stream.read(size) if size else b"", 0, []
-    while at < size:
-        opcode, length = _RECORD.unpack_from(data, at)
-        at, end = at + _RECORD.size, at + _RECORD.size + length
-        if end > size:
-            raise EndOfFile()
-        if opcode == Opcode.MESSAGE:
-            channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(data, at)
-            content = data[at + _MESSAGE.size : end]
-            records.append(Message(channel, log_time, content, publish_time, sequence))
-        elif opcode == Opcode.CHANNEL:
-            records.append(Channel.read(ReadDataStream(BytesIO(data[at:end]))))
-        elif opcode == Opcode.SCHEMA:
-            records.append(Schema.read(ReadDataStream(BytesIO(data[at:end]))))
-        at = end
-    return records
 
 
 class RosWriter:
@@ -142,14 +117,10 @@ class RosWriter:
 
     def write(self, topic: str, message: Any, log_time: int) -> None:
         """Append a message of rosbags' type store."""
-        self.write_encoded(topic, message.__msgtype__, ros.encode(message), log_time)
-
-    def write_encoded(self, topic: str, type_name: str, data: bytes, log_time: int) -> None:
-        """Append a message of a type, given as its CDR."""
         channel = self._channels.get(topic)
         if channel is None:
-            channel = self._channels[topic] = self._register(topic, type_name)
-        self.mcap.add_message(channel, log_time, data, log_time)
+            channel = self._channels[topic] = self._register(topic, message.__msgtype__)
+        self.mcap.add_message(channel, log_time, ros.encode(message), log_time)
 
     def _register(self, topic: str, type_name: str) -> int:
         if type_name not in self._schemas:

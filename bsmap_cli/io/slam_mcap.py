@@ -30,9 +30,10 @@ import numpy as np
 from bsmap_cli.errors import BadInputError
 from bsmap_cli.io import ros
 from bsmap_cli.io.artifact import Provenance
-from bsmap_cli.io.mcap_file import read_messages, ros_writer
+from bsmap_cli.io.mcap_file import RosWriter, read_messages, ros_writer
 from bsmap_cli.model import (
     Array,
+    IntArray,
     LaserScans,
     LineMap,
     LoopClosures,
@@ -43,7 +44,6 @@ from bsmap_cli.model import (
 )
 
 VERSION = 3
-_BATCH = 4096
 STEP_COLUMNS = "theta new stored matched nis dof"
 _READ = (ros.STRING, ros.NUMBERS, ros.POSE_WITH_COVARIANCE, ros.LASER_SCAN)
 SEGMENT_COLOR, HELD_COLOR, REFUSED_COLOR = (0.1, 0.5, 1.0), (0.1, 0.8, 0.2), (0.9, 0.2, 0.1)
@@ -51,10 +51,10 @@ _LASER_FIELDS = ("angle_min", "angle_increment", "time_increment", "range_min", 
 
 
 class _Messages(NamedTuple):
-    """Messages of one moment: topic, type and CDR of each."""
+    """Messages of one moment, by topic."""
 
     time_ns: int
-    encoded: tuple[tuple[str, str, bytes], ...]
+    by_topic: tuple[tuple[str, Any], ...]
 
 
 def write_slam(path: Path | str, slam: SlamMap, provenance: Provenance | None = None) -> None:
@@ -68,21 +68,22 @@ def write_slam(path: Path | str, slam: SlamMap, provenance: Provenance | None = 
     rows = merge(_steps(slam), _vertical_scans(slam.vertical), key=lambda row: row.time_ns)
     start = min(_first_times(slam), default=0)
     with ros_writer(path, provenance) as writer:
-        for topic, message in _map_messages(slam, start):
-            writer.write(topic, message, start)
-        for topic, data in _paths(slam, start):
-            writer.write_encoded(topic, ros.PATH, data, start)
+        _write_at(writer, _Messages(start, tuple(_map_messages(slam, start))), start)
         log_time = start
         for row in rows:
             log_time = max(row.time_ns, log_time + 1)
-            for topic, type_name, data in row.encoded:
-                writer.write_encoded(topic, type_name, data, log_time)
+            _write_at(writer, row, log_time)
 
 
 def _first_times(slam: SlamMap) -> Iterator[int]:
     for times in (slam.trajectory.time_ns, slam.vertical.time_ns if slam.vertical else ()):
         if len(times):
             yield int(np.min(times))
+
+
+def _write_at(writer: RosWriter, row: _Messages, log_time: int) -> None:
+    for topic, message in row.by_topic:
+        writer.write(topic, message, log_time)
 
 
 def _map_messages(slam: SlamMap, start: int) -> Iterator[tuple[str, Any]]:
@@ -100,7 +101,9 @@ def _map_messages(slam: SlamMap, start: int) -> Iterator[tuple[str, Any]]:
     chords = np.stack([slam.trajectory.poses[loops.first, :2], slam.trajectory.poses[loops.second, :2]], axis=1)
     colors = np.where(loops.held[:, None], HELD_COLOR, REFUSED_COLOR)
     yield "/map/closures", ros.line_list_message("closures", chords, colors, 0.05, height, start)
+    yield "/trajectory", _path(slam.trajectory.time_ns, slam.trajectory.poses, start)
     if slam.tracked_poses is not None:
+        yield "/trajectory_tracked", _path(slam.trajectory.time_ns, slam.tracked_poses, start)
         yield "/bsmap/tracked", ros.numbers_message(slam.tracked_poses, "x y theta")
     if slam.trajectory.modes is not None:
         yield "/bsmap/modes", ros.numbers_message(slam.trajectory.modes, "modes of x, y, theta")
@@ -121,48 +124,39 @@ def _header(slam: SlamMap) -> dict[str, Any]:
     }
 
 
-def _paths(slam: SlamMap, start: int) -> Iterator[tuple[str, bytes]]:
-    """CDR of the poses, and of those before loops were closed."""
-    for topic, poses in (("/trajectory", slam.trajectory.poses), ("/trajectory_tracked", slam.tracked_poses)):
-        if poses is not None:
-            yield topic, ros.encode_path(slam.trajectory.time_ns, poses, start)
+def _path(time_ns: IntArray, poses: Array, start: int) -> Any:
+    stamped = [
+        ros.make("geometry_msgs/msg/PoseStamped", header=ros.header(t, "map"), pose=ros.pose_message(pose))
+        for t, pose in zip(time_ns.tolist(), poses, strict=True)
+    ]
+    return ros.make(ros.PATH, header=ros.header(start, "map"), poses=stamped)
 
 
 def _steps(slam: SlamMap) -> Iterator[_Messages]:
     """Pose, transform and statistics of each horizontal scan."""
     trajectory, s = slam.trajectory, slam.statistics
-    steps = np.column_stack([trajectory.poses[:, 2], s.new, s.stored, s.matched, s.nis, s.dof])
-    for start in range(0, len(steps), _BATCH):
-        some = slice(start, start + _BATCH)
-        time_ns, poses = trajectory.time_ns[some], ros.pose_numbers(trajectory.poses[some])
-        both = np.concatenate([poses, trajectory.covariances[some].reshape(-1, 9)], axis=1)
-        encoded = [
-            ("/pose", ros.POSE_WITH_COVARIANCE, ros.encode_alike(_pose, time_ns, both)),
-            ("/tf", ros.TF_MESSAGE, ros.encode_alike(_transform, time_ns, poses)),
-            ("/bsmap/steps", ros.NUMBERS, ros.encode_alike(_step, time_ns, steps[some])),
-        ]
-        for k, t in enumerate(time_ns.tolist()):
-            yield _Messages(t, tuple((topic, type_name, data[k]) for topic, type_name, data in encoded))
+    numbers = np.column_stack([trajectory.poses[:, 2], s.new, s.stored, s.matched, s.nis, s.dof])
+    for k, t in enumerate(trajectory.time_ns.tolist()):
+        pose, covariance = trajectory.poses[k], trajectory.covariances[k]
+        stamped = ros.make(
+            ros.POSE_WITH_COVARIANCE, header=ros.header(t, "map"), pose=ros.pose_with_covariance(pose, covariance)
+        )
+        tf = ros.tf_message([ros.transform_message(planar_matrix(pose), t, "map", "base_link")])
+        yield _Messages(
+            t, (("/pose", stamped), ("/tf", tf), ("/bsmap/steps", ros.numbers_message(numbers[k], STEP_COLUMNS)))
+        )
 
 
-def _pose(time_ns: int, numbers: Array) -> Any:
-    """Message of a pose as `ros.pose_numbers` has it, and its covariance, (13,) together."""
-    pose = ros.pose_with_covariance(ros.pose_of_numbers(numbers[:4]), numbers[4:].reshape(3, 3))
-    return ros.make(ros.POSE_WITH_COVARIANCE, header=ros.header(time_ns, "map"), pose=pose)
-
-
-def _transform(time_ns: int, numbers: Array) -> Any:
-    return ros.tf_message([ros.planar_transform(numbers, time_ns, "map", "base_link")])
-
-
-def _step(_time_ns: int, numbers: Array) -> Any:
-    return ros.numbers_message(numbers, STEP_COLUMNS)
+def planar_matrix(pose: Array) -> Array:
+    """Matrix (4, 4) of a planar pose (3,) x, y, theta."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    return np.array([[c, -s, 0, pose[0]], [s, c, 0, pose[1]], [0, 0, 1, 0], [0, 0, 0, 1.0]])
 
 
 def _vertical_scans(vertical: LaserScans | None) -> Iterator[_Messages]:
     if vertical is not None:
         for t, ranges in zip(vertical.time_ns.tolist(), vertical.ranges, strict=True):
-            yield _Messages(t, ((vertical.topic, ros.LASER_SCAN, ros.encode(ros.scan_of(vertical, t, ranges))),))
+            yield _Messages(t, ((vertical.topic, ros.scan_of(vertical, t, ranges)),))
 
 
 def read_slam(path: Path | str) -> SlamMap:

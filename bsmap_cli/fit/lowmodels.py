@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bsmap_cli.core.three import solve_three
 from bsmap_cli.fit.blocks import Blocks
 from bsmap_cli.model import Array
 
@@ -173,13 +174,8 @@ def _three_unknowns(G: list[list[float]]) -> Array:
     aa, bb, cc = aa * p * p + UNTOLD, bb * q * q + UNTOLD, cc * r * r + UNTOLD
     ab, ac, bc = ab * p * q, ac * p * r, bc * q * r
     ad, bd, cd = ad * p, bd * q, cd * r
-    # L D L' with the last unknown first known.
-    f, g = ab / aa, ac / aa
-    bb, bc, bd = bb - f * ab, bc - f * ac, bd - f * ad
-    h = bc / bb
-    z = (cd - g * ad - h * bd) / (cc - g * ac - h * bc)
-    y = bd / bb - h * z
-    return np.array([p * (ad / aa - f * y - g * z), q * y, r * z])
+    x, y, z = solve_three((aa, ab, ac, bb, bc, cc), (ad, bd, cd))
+    return np.array([p * x, q * y, r * z])
 
 
 def axes_of(normal: Array) -> Array:

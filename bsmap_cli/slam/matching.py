@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from bsmap_cli.core.three import solve_three
 from bsmap_cli.model import Array, IntArray
 from bsmap_cli.slam.segments import ScanPoints
 
@@ -24,8 +25,6 @@ SEARCH_STEP, SEARCH_STEPS, SEARCH_ANGLE, SEARCH_CELLS = 0.3, 8, 0.12, 6
 a step within which all points have the same nearest one."""
 LEAST_REACH = 0.15
 """Metres within which points pair in the end."""
-LEAST_PIVOT = 1e-12
-"""Of the normal equations, below which rounding is all there is."""
 _FACTORS = np.array([[1.0, 0, 0, 0, 0, 0], [0, 1.0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0], [0, 0, 0, 0, -1.0, 0]])
 """Of the terms of a pair in the derivatives of its error and in the error, where the pose does not change them."""
 SAME_WAY = 0.7
@@ -223,24 +222,12 @@ def _moments(pairs: _Pairs, pose: Floats, width: float, sigma: float) -> tuple[A
 
 
 def _step(moments: list[list[float]], prior: list[list[float]], away: Floats) -> Floats:
-    """Step of Gauss-Newton from the moments (4, 4) and from the prior (3, 3) of the pose that is `away`.
-
-    By LDL' on plain numbers, for numpy's calls take several times as long for so few. Where neither tells anything,
-    what rounding leaves of a pivot must not become a step.
-    """
+    """Step of Gauss-Newton from the moments (4, 4) and from the prior (3, 3) of the pose that is `away`."""
     (a, b, c, u), (_, d, e, v), (_, _, f, w), _ = moments
     x, y, theta = away[0], away[1], math.remainder(away[2], math.tau)
     (pa, pb, pc), (_, pd, pe), (_, _, pf) = prior
-    u, v, w = -u - pa * x - pb * y - pc * theta, -v - pb * x - pd * y - pe * theta, -w - pc * x - pe * y - pf * theta
-    a, b, c, d, e, f = a + pa, b + pb, c + pc, d + pd, e + pe, f + pf
-    a = max(a, LEAST_PIVOT)
-    ba, ca = b / a, c / a
-    d, e, f, least = max(d - ba * b, LEAST_PIVOT * (1.0 + d)), e - ba * c, f - ca * c, LEAST_PIVOT * (1.0 + f)
-    v, w = v - ba * u, w - ca * u
-    ed = e / d
-    theta = (w - ed * v) / max(f - ed * e, least)
-    y = v / d - ed * theta
-    return u / a - ba * y - ca * theta, y, theta
+    side = -u - pa * x - pb * y - pc * theta, -v - pb * x - pd * y - pe * theta, -w - pc * x - pe * y - pf * theta
+    return solve_three((a + pa, b + pb, c + pc, d + pd, e + pe, f + pf), side)
 
 
 def _has_moved(before: Floats, pose: Floats) -> bool:

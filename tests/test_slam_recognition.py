@@ -12,7 +12,7 @@ from bsmap_cli.slam import run_slam
 from bsmap_cli.slam.loops import close_loops, lost_runs
 from bsmap_cli.slam.matching import OrientedPoints
 from bsmap_cli.slam.recognition import TURN_STEP, fingerprint, likely_turns
-from bsmap_cli.slam.tracking import track_scans
+from bsmap_cli.slam.tracking import adrift, track_scans
 from bsmap_cli.track import silent
 
 FIRST = along([(-1, -1), (15, -1), (15, 9), (-1, 9)], 0.15, 0.15)
@@ -63,6 +63,20 @@ def test_robot_whose_odometry_is_whole_is_not_taken_for_lost():
     assert lost_runs(tracking) == []
     without = track_scans(log_of(ring(), FIRST[:40], odometry_error=None, beams=240), SIGMA, SlamParams(), silent)
     assert without.adrift[1:].all()
+
+
+def test_gap_in_which_odometry_goes_on_as_ever_is_a_stand():
+    """Logs of a scan a metre have long gaps where the robot stands; only a step like no other, or none, is doubtful."""
+    odometry = np.column_stack([np.arange(12.0), np.zeros((12, 2))])
+    odometry[8:, 0] += 4.0
+    odometry[10:] = odometry[:2]
+    scans = log_of(room(), odometry * 0.1).horizontal
+    scans = replace(scans, time_ns=np.cumsum([0, *[2 + 40 * (k in (3, 7, 9)) for k in range(11)]]) * 10**9)
+    keys = np.arange(12)
+    assert np.flatnonzero(adrift(ScanLog(scans, odometry, None), keys)).tolist() == [8, 10]
+    stands = odometry.copy()
+    stands[4:] -= odometry[4] - odometry[3]
+    assert np.flatnonzero(adrift(ScanLog(scans, stands, None), keys)).tolist() == [4, 8, 10]
 
 
 def test_fingerprint_is_the_same_from_wherever_a_place_is_looked_at():

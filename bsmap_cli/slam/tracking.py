@@ -43,8 +43,9 @@ first so far from the prediction (squared Mahalanobis distance), the match is no
 MATCH_FLOOR = np.array([0.003, 0.003, 0.0015])
 """Metres and radians that a match is off at the least, for walls are rough."""
 MOST_POINTS = 400
-JUMP, GAP = (0.5, 0.5), 10.0
-"""Metres and radians of odometry beyond what speed allows, and seconds, after which a robot may be anywhere."""
+JUMP, GAP, STILL = (0.5, 0.5), 10.0, 0.01
+"""Metres and radians of odometry beyond what speed allows, and seconds, after which a robot may be anywhere; metres
+and radians that are no motion."""
 LEAST_SPREAD = np.array([0.02, 0.02, 0.01])
 """Metres and radians by which a prediction can be off however short the step."""
 
@@ -82,7 +83,7 @@ def track_scans(log: ScanLog, range_sigma: float, params: SlamParams, track: Tra
     key_points.append(next(scans))
     placed, watch = [key_points[0]], Watch(log.horizontal)
     moves = [watch.add(0, poses[0], placed[0], True)]
-    broken = _adrift(log, np.arange(n)) if log.odometry is not None else np.zeros(n, bool)
+    broken = adrift(log, np.arange(n)) if log.odometry is not None else np.zeros(n, bool)
     target = make_target(placed[0])
     for k, points in enumerate(scans, 1):
         track("slam: tracking", k + 1, n)
@@ -113,26 +114,31 @@ def track_scans(log: ScanLog, range_sigma: float, params: SlamParams, track: Tra
     match_information = np.array(by_match).reshape(-1, 3, 3)
     information = _edge_information(match_information, np.array(priors).reshape(-1, 3, 3), weak[1:])
     chain = _chain(poses[keys], information, np.array(inliers))
-    adrift = _adrift(log, np.array(keys))
+    drifts = adrift(log, np.array(keys))
     key_points = [_standing(*both) for both in zip(key_points, moves, strict=True)]
-    return Tracking(poses, np.array(keys), key_points, chain, match_information, weak, adrift, scale.value, matched)
+    return Tracking(poses, np.array(keys), key_points, chain, match_information, weak, drifts, scale.value, matched)
 
 
 def _standing(points: OrientedPoints, moves: NDArray[np.bool_]) -> OrientedPoints:
     return take(points, ~moves) if moves.any() else points
 
 
-def _adrift(log: ScanLog, keys: IntArray) -> NDArray[np.bool_]:
+def adrift(log: ScanLog, keys: IntArray) -> NDArray[np.bool_]:
     """(k,) key scans to which the robot did not get from the one before in the way that odometry and stamps tell."""
     if log.odometry is None:
         return np.arange(len(keys)) > 0
     seconds = np.diff(log.horizontal.time_ns[keys]) * 1e-9
-    step = se2.between(log.odometry[keys[:-1]], log.odometry[keys[1:]])
-    time = np.maximum(seconds, 0.0)
-    jump = (np.hypot(step[:, 0], step[:, 1]) > JUMP[0] + MAX_SPEED * time) | (
-        np.abs(step[:, 2]) > JUMP[1] + MAX_TURN_RATE * time
-    )
-    return np.concatenate([[False], jump | (seconds > GAP)])
+    odometry = log.odometry[keys]
+    step = np.abs(se2.between(odometry[:-1], odometry[1:]))
+    step = np.column_stack([np.hypot(step[:, 0], step[:, 1]), step[:, 2]])
+    time = np.maximum(seconds, 0.0)[:, None]
+    jump = (step > np.array(JUMP) + np.array([MAX_SPEED, MAX_TURN_RATE]) * time).any(axis=1)
+    gap = seconds > GAP
+    # Logs that take a scan a metre have gaps where the robot stands; then odometry goes on as between other scans.
+    usual = 1.5 * step[~gap].max(axis=0, initial=0.0)
+    anew = (np.abs(odometry[1:] - odometry[0]) < STILL).all(axis=1)
+    goes_on = (step <= usual).all(axis=1) & (step > STILL).any(axis=1) & ~anew
+    return np.concatenate([[False], jump | (gap & ~goes_on)])
 
 
 def _local(inliers: list[float]) -> list[int]:

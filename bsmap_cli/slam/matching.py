@@ -17,6 +17,8 @@ from bsmap_cli.slam.segments import ScanPoints
 
 NORMAL_REACH = 0.12
 """Metres to each side over which a point's normal is fitted."""
+NORMAL_SIGMA = 0.2
+"""Radians, standard deviation of a normal by the noise of the points beyond which it tells nothing."""
 
 
 SEARCH_POINTS = 70
@@ -122,7 +124,6 @@ def oriented_points(points: ScanPoints, laser_xy: Array, range_sigma: float) -> 
     first, last = (np.repeat(border[k : len(border) - 1 + k], np.diff(border)) for k in (0, 1))
     half = np.rint(NORMAL_REACH / np.maximum(points.range * step, 1e-4)).clip(2, 12).astype(int)
     index = np.arange(n)
-    half = np.minimum(half, np.maximum(np.minimum(index - first, last - 1 - index), 1))
     low, high = np.maximum(index - half, first), np.minimum(index + half + 1, last)
     sums = np.zeros((5, n + 1))
     np.cumsum([x, y, x * x, x * y, y * y], axis=1, out=sums[:, 1:])
@@ -131,7 +132,9 @@ def oriented_points(points: ScanPoints, laser_xy: Array, range_sigma: float) -> 
     middle, half_difference = (xx + yy) / 2, (xx - yy) / 2
     spread = np.sqrt(half_difference**2 + xy**2)
     across, along = middle - spread, middle + spread
-    good = np.flatnonzero((high - low >= 3) & (across < 0.15 * along) & (across < (5 * range_sigma) ** 2))
+    count = high - low
+    straight = (across < 0.15 * along) & (across < (5 * range_sigma) ** 2)
+    good = np.flatnonzero((count >= 3) & straight & (count * along > (range_sigma / NORMAL_SIGMA) ** 2))
     at, normal = points.xy[good], _normals(half_difference[good], xy[good], spread[good])
     normal[np.einsum("ij,ij->i", normal, at - laser_xy) > 0] *= -1
     return OrientedPoints(at, normal), good
@@ -181,7 +184,7 @@ def match(
     """
     start: Floats = tuple(initial.tolist())
     pose, known = start, prior.tolist()
-    floor = max(2 * range_sigma, 0.05)
+    floor = least_width(range_sigma)
     pairs = None
     for _ in range(iterations):
         if pairs is None or _has_moved(pairs.pose, pose):
@@ -200,6 +203,11 @@ def match(
     rms = math.sqrt(float(on @ on) / len(on)) if len(on) else 0.0
     wrapped = np.array([pose[0], pose[1], math.remainder(pose[2], math.tau)])
     return Match(wrapped, moments[:3, :3], len(on) / max(len(source.xy), 1), rms)
+
+
+def least_width(sigma: float) -> float:
+    """Metres off a line within which a point is on it; sigma: of its distance."""
+    return max(2 * sigma, 0.05)
 
 
 def _moments(pairs: _Pairs, pose: Floats, width: float, sigma: float) -> tuple[Array, Array]:

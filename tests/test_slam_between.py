@@ -18,6 +18,7 @@ from bsmap_cli.slam.between import (
 )
 from bsmap_cli.slam.posegraph import Edges
 from bsmap_cli.slam.tracking import MATCH_FLOOR, Tracking
+from bsmap_cli.slam.visibility import Views
 
 WAY = along([(0.0, 0.0), (6.0, 0.0), (6.0, 4.0), (0.0, 4.0)], 0.05, 0.05)
 KEYS = np.arange(0, len(WAY), 6)
@@ -36,7 +37,9 @@ def tracking_of(poses: np.ndarray, matched: np.ndarray | None = None) -> Trackin
     no, every = np.zeros(len(KEYS), bool), np.ones(len(poses), bool)
     edges = chain(poses[KEYS], told)
     matched = every if matched is None else matched
-    return Tracking(poses, KEYS, [], edges, edges.information, no, no, 1.0, matched)
+    return Tracking(
+        poses, KEYS, [], edges, edges.information, no, no, 1.0, matched, Views(scans_of(np.arange(len(poses)), 0.0))
+    )
 
 
 def scans_of(stamps: np.ndarray, time_increment: float) -> LaserScans:

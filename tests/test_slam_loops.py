@@ -1,19 +1,23 @@
 """Loops: closed where the robot was before, refused where one place only looks like another."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from flat_world import SIGMA, along, box, in_first, log_of, polygon, ring
+from flat_world import SIGMA, along, box, in_first, log_of, polygon, ring, room
 
 from bsmap_cli.core import se2
 from bsmap_cli.model import ScanLog
 from bsmap_cli.params import SlamParams
 from bsmap_cli.slam import loops, run_slam
+from bsmap_cli.slam.candidates import far_candidates, is_loop
 from bsmap_cli.slam.loops import close_loops
 from bsmap_cli.slam.matching import OrientedPoints, make_target
 from bsmap_cli.slam.posegraph import Edges
 from bsmap_cli.slam.recognition import FEWEST_WITNESSES, witnesses
-from bsmap_cli.slam.submaps import Search, register
+from bsmap_cli.slam.submaps import Search, register, revisit, target_map
 from bsmap_cli.slam.tracking import Tracking, track_scans
+from bsmap_cli.slam.visibility import Views
 from bsmap_cli.track import silent
 
 ROUND = along([(-1, -1), (15, -1), (15, 9), (-1, 9), (-1, -1), (6, -1)], 0.15, 0.15)
@@ -61,7 +65,7 @@ def test_lap_closes_however_tracking_bent_it(lap, turn, stretch):
     after = place_errors(found.poses, truth)
     assert len(found.closures.first) >= 3
     assert wrong(found.closures, truth).max() < 0.1
-    assert np.all(loops.is_loop(found.poses, found.closures))
+    assert np.all(is_loop(found.poses, found.closures))
     ends = np.abs(np.diff([found.closures.first, found.closures.second], axis=0)).min()
     assert ends > 20, "key scans of one visit are no loop"
     last = len(truth) - 1
@@ -116,7 +120,7 @@ def test_places_alike_side_by_side_are_not_taken_for_one():
 
 def look(poses: np.ndarray) -> Search:
     way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
-    return Search([], poses, way, 0.03)
+    return Search([], poses, way, 0.03, np.arange(len(poses)), Views(log_of(room(), poses[:1]).horizontal))
 
 
 def edges(*found: tuple[int, int, tuple[float, float, float]]) -> Edges:
@@ -144,11 +148,27 @@ def test_bold_closures_need_another_one_that_agrees():
     assert loops._supported(look(way), far_off).tolist() == [True, True] if loops.SUPPORT_WAY > 10 else [False, False]
 
 
+def test_wide_searches_go_where_the_graph_leaves_places_far_apart():
+    """Out for 70 m and back 3 m beside it: the farther from the turn, the less is known of how the ways lie."""
+    back = np.column_stack([np.arange(69.0, -1, -1), np.full(70, 3.0), np.full(70, np.pi)])
+    way = np.concatenate([np.column_stack([np.arange(71.0), np.zeros((71, 2))]), back])
+    n = len(way)
+    steps = [(k, k + 1, tuple(se2.between(way[k], way[k + 1]))) for k in range(n - 1)]
+    sure = np.zeros(n + 1, bool)
+    far = list(far_candidates(look(way), 3.0, edges(*steps)._replace(robust=sure[: n - 1])))
+    assert all(before == n - 1 - here for here, before, _ in far)
+    assert all(reach > 2.0 for _, _, reach in far)
+    closed = [*steps, (0, n - 1, tuple(se2.between(way[0], way[-1]))), (30, 110, tuple(se2.between(way[30], way[110])))]
+    far = list(far_candidates(look(way), 3.0, edges(*closed)._replace(robust=sure)))
+    assert far, "between the two closures and the turn nothing holds"
+    assert {here for here, _, _ in far} <= set(range(70, 101)) | set(range(120, 131))
+
+
 def test_closure_that_stands_alone_finds_the_others_that_bear_it_out(lap):
     """Drifted so far that the place is no candidate: a true closure leads to its neighbours, a false one to none."""
     tracking, truth = lap
     drifted = bent(tracking, 0.005)
-    seen = look(drifted.poses[drifted.keys])._replace(points=tracking.points)
+    seen = look(drifted.poses[drifted.keys])._replace(points=tracking.points, keys=tracking.keys, views=tracking.views)
     last = len(truth) - 5
     first = int(np.argmin(np.hypot(*(truth[: last // 2] - truth[last])[:, :2].T)))
     assert np.hypot(*(seen.poses[first] - seen.poses[last])[:2]) > 3.0, "the drift hides the place"
@@ -242,3 +262,24 @@ def test_doors_tell_the_place_along_a_corridor():
     assert found is not None
     assert 1 / 0.03**2 < found.information[0, 0] < 13 / 0.03**2
     assert found.pose == pytest.approx(0.0, abs=0.01)
+
+
+def test_corridor_that_looks_like_another_is_refused_by_what_stands_in_its_doorways():
+    """Two straight corridors alike but for a room behind the doorway of the one and a closed one in the other."""
+    walls = polygon((-1, -1), (21, -1), (21, 1), (11, 1), (11, 4), (9, 4), (9, 1), (-1, 1))
+    others = polygon((-1, -1), (21, -1), (21, 1), (11, 1), (11, 1.3), (9, 1.3), (9, 1), (-1, 1))
+    way = along([(0, 0), (20, 0)], 0.2)
+    once, again, elsewhere = (log_of(world, way, seed) for seed, world in enumerate((walls, walls, others)))
+    for second, held in ((again, True), (elsewhere, False)):
+        scans = once.horizontal
+        ranges = np.concatenate([scans.ranges, second.horizontal.ranges])
+        both = replace(scans, ranges=ranges, time_ns=np.arange(len(ranges)) * 10**8)
+        first = track_scans(once, SIGMA, SlamParams(), silent)
+        back = track_scans(second, SIGMA, SlamParams(), silent)
+        poses = np.concatenate([first.poses[first.keys], back.poses[back.keys] + [0.6, 0.0, 0.0]])
+        keys = np.concatenate([first.keys, back.keys + len(way)])
+        seen = Search([*first.points, *back.points], poses, np.arange(len(poses)), 0.03, keys, Views(both))
+        here, there = len(first.keys) // 2, len(first.keys) + len(back.keys) // 2
+        guess = se2.between(poses[here], poses[there])
+        found = revisit(seen, target_map(seen, here), here, there, guess, 3.0, 0.5)
+        assert (found is not None) == held

@@ -6,8 +6,9 @@ from flat_world import SIGMA, along, box, in_first, log_of, polygon
 
 from bsmap_cli.params import SlamParams
 from bsmap_cli.slam.matching import OrientedPoints
-from bsmap_cli.slam.moving import SHORT, Watch, free_ranges
+from bsmap_cli.slam.moving import Watch
 from bsmap_cli.slam.tracking import track_scans
+from bsmap_cli.slam.visibility import Views
 from bsmap_cli.track import silent
 
 CORRIDOR = polygon((-1, -1), (31, -1), (31, 1), (-1, 1))
@@ -22,12 +23,13 @@ def with_company(way: np.ndarray, ahead: list[float], side: float = 0.5) -> np.n
 
 def watched(log, way: np.ndarray, step: int = 5, sure: bool = True) -> tuple[np.ndarray, np.ndarray]:
     """Points of every `step`-th scan, at true poses, and whether they are told to move."""
-    scans, watch, found = log.horizontal, Watch(log.horizontal), []
+    scans, views, found = log.horizontal, Views(log.horizontal), []
+    watch = Watch(views)
     for k in range(0, len(way), step):
         c, s = np.cos(scans.angles + way[k, 2]), np.sin(scans.angles + way[k, 2])
         seen = np.isfinite(scans.ranges[k])
         xy = way[k, :2] + (scans.ranges[k] * np.array([c, s])).T[seen].astype(float)
-        found.append((xy, watch.add(k, way[k], OrientedPoints(xy, np.zeros_like(xy)), sure)))
+        found.append((xy, watch.add(views.view(k, way[k]), OrientedPoints(xy, np.zeros_like(xy)), sure)))
     return tuple(np.concatenate(part) for part in zip(*found, strict=True))
 
 
@@ -62,15 +64,6 @@ def test_what_stands_in_the_open_stays():
     pillar = np.abs(xy[:, 1] - 0.36) < 0.1
     assert pillar.sum() > 200
     assert moves[pillar].mean() < 0.05
-
-
-def test_free_is_less_than_the_shortest_beam_beside_and_unknown_without_return():
-    ranges = np.full(100, 5.0, np.float32)
-    ranges[50], ranges[80] = 2.0, np.nan
-    free = free_ranges(ranges, 0.02)
-    assert free[10] == pytest.approx(5.0 - SHORT)
-    np.testing.assert_allclose(free[48:53], 2.0 - SHORT)
-    assert (free[78:83] <= 0).all()
 
 
 @pytest.mark.parametrize("seed", range(3))

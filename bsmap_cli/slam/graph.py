@@ -9,9 +9,10 @@ from bsmap_cli.core.table import joined, take
 from bsmap_cli.model import IntArray, LineMap, LoopClosures, ScanLog, SlamMap, StepStatistics, Trajectory
 from bsmap_cli.params import SlamParams
 from bsmap_cli.slam.between import evenly, every_scan
+from bsmap_cli.slam.candidates import is_loop
 from bsmap_cli.slam.latency import lined_up, odometry_delay
 from bsmap_cli.slam.lines import MappedLines, map_lines
-from bsmap_cli.slam.loops import Closures, close_loops, is_loop
+from bsmap_cli.slam.loops import Closures, close_loops
 from bsmap_cli.slam.marginals import Marginals, marginals
 from bsmap_cli.slam.motion import beam_motion, odometry_motion
 from bsmap_cli.slam.posegraph import Edges

@@ -1,6 +1,5 @@
 """Loop closing: places seen before, recognised by matching small maps of key scans, verified, smoothed over."""
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -10,9 +9,10 @@ from bsmap_cli.core import se2
 from bsmap_cli.core.table import joined, take
 from bsmap_cli.model import Array
 from bsmap_cli.slam import posegraph
+from bsmap_cli.slam.candidates import far_candidates, near_candidates
 from bsmap_cli.slam.matching import Target, make_target
 from bsmap_cli.slam.posegraph import Edges
-from bsmap_cli.slam.recognition import LEAST_WAY, REACH, recognised, witnesses
+from bsmap_cli.slam.recognition import recognised, witnesses
 from bsmap_cli.slam.submaps import (
     SOURCE_KEYS,
     TARGET_KEYS,
@@ -21,6 +21,7 @@ from bsmap_cli.slam.submaps import (
     closure_edge,
     no_edges,
     register,
+    revisit,
     small_map,
     source_map,
     target_map,
@@ -31,13 +32,8 @@ from bsmap_cli.track import Track
 ROUNDS = 8
 SPACING = 1.0
 """Metres of way between key scans for which loops are sought."""
-WIDE_SPACING, WIDE_TURN, UNHELD = 3.0, 0.5, 10.0
-"""Metres of way between wide searches, and between candidates of a first look round; radians to both sides, metres of
-way from any closure where they are made."""
-DRIFT, MOST_REACH = 0.02, 10.0
-"""A place counts as near within REACH metres, and DRIFT more for each metre of way since, up to MOST_REACH."""
-PASSES = 3
-"""Earlier visits to a place that are tried, nearest first."""
+WIDE_SPACING, WIDE_TURN = 3.0, 0.5
+"""Metres of way between wide searches, and between candidates of a first look round; radians to both sides."""
 KEPT = 64
 """Small maps that are kept for the next candidates, for neighbours ask for the same ones."""
 SUPPORT_WAY = 10.0
@@ -68,17 +64,17 @@ def close_loops(tracking: Tracking, range_sigma: float, track: Track) -> Closure
     alone = [no_edges()]
     if len(closures.first):
         poses = posegraph.optimise(poses, joined([chain, closures])).poses
-    poses, chain, again = recognised(Search(tracking.points, poses, way, noise), lost_runs(tracking), chain, closures)
+    poses, chain, again = recognised(_search(tracking, poses, noise), lost_runs(tracking), chain, closures)
     closures = joined([closures, again])
     if len(again.first):
         poses = posegraph.optimise(poses, joined([chain, closures])).poses
     wide = False
     for k in range(ROUNDS):
         track("slam: loops", k, ROUNDS)
-        look = Search(tracking.points, poses, way, noise)
+        look = _search(tracking, poses, noise)._replace(way=way)
         # A first look at few places sets the poses right for the others: fewer candidates lead nowhere.
         spacing = WIDE_SPACING if wide or k == 0 else SPACING
-        found = _find(look, closures, failed, spacing, _far_from(closures, way) if wide else None)
+        found = _find(look, closures, failed, spacing, joined([chain, closures]) if wide else None)
         if wide:
             found = joined([found, witnesses(look, take(found, ~_supported(look, found)))])
         supported = _supported(look, found)
@@ -107,6 +103,12 @@ def close_loops(tracking: Tracking, range_sigma: float, track: Track) -> Closure
     return Closures(poses, chain, closures, joined([refused, _never_made(alone, closures, refused)]))
 
 
+def _search(tracking: Tracking, poses: Array, noise: float) -> Search:
+    """The key scans at poses (n, 3)."""
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
+    return Search(tracking.points, poses, way, noise, tracking.keys, tracking.views)
+
+
 def _never_made(alone: list[Edges], *made: Edges) -> Edges:
     """The last one of each pair of key scans that no edge of `made` joins."""
     found = joined(alone)
@@ -114,15 +116,6 @@ def _never_made(alone: list[Edges], *made: Edges) -> Edges:
     pairs = zip(found.first.tolist(), found.second.tolist(), strict=True)
     last = {pair: k for k, pair in enumerate(pairs) if pair not in joins}
     return take(found, np.array(sorted(last.values()), int))
-
-
-def is_loop(poses: Array, edges: Edges) -> NDArray[np.bool_]:
-    """(m,) edges with so much way along the poses (n, 3) between their ends that they close a loop.
-
-    The others lead past scans that could not be matched.
-    """
-    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
-    return np.asarray(way[edges.second] - way[edges.first] > LEAST_WAY)
 
 
 def _holding(poses: Array, closures: Edges) -> NDArray[np.bool_]:
@@ -145,7 +138,7 @@ def lost_runs(tracking: Tracking) -> list[tuple[int, int]]:
 def _relinks(tracking: Tracking, noise: float) -> Edges:
     """An edge across each run of failed key scans: the small maps on both sides of it, matched."""
     poses = tracking.poses[tracking.keys]
-    look = Search(tracking.points, poses, np.zeros(len(poses)), noise)
+    look = _search(tracking, poses, noise)
     parts = [no_edges()]
     for start, after in failed_runs(tracking.weak):
         before = start - 1
@@ -157,21 +150,12 @@ def _relinks(tracking: Tracking, noise: float) -> Edges:
     return joined(parts)
 
 
-def _far_from(closures: Edges, way: Array) -> NDArray[np.bool_]:
-    """(n,) key scans that are a long way from any that a closure holds."""
-    held = np.sort(way[np.concatenate([closures.first, closures.second])])
-    if len(held) == 0:
-        return np.ones(len(way), bool)
-    next_one = np.searchsorted(held, way).clip(1, len(held) - 1) if len(held) > 1 else np.zeros(len(way), int)
-    return np.minimum(np.abs(way - held[next_one]), np.abs(way - held[next_one - 1])) > UNHELD
-
-
 def _relocated(tracking: Tracking, poses: Array, noise: float) -> Edges:
     """Edges of failed key scans to the one before, from a match to the smoothed map of those before and after.
 
     What tracking could not place, for most of what it saw was new or the odometry was wrong, has its place now.
     """
-    look = Search(tracking.points, poses, np.zeros(len(poses)), noise)
+    look = _search(tracking, poses, noise)
     sound = np.flatnonzero(~tracking.weak)
     found = [no_edges()]
     for key in np.flatnonzero(tracking.weak).tolist():
@@ -192,30 +176,29 @@ def _find(
     closures: Edges,
     failed: dict[tuple[int, int], Array],
     spacing: float,
-    wide: NDArray[np.bool_] | None = None,
+    graph: Edges | None = None,
 ) -> Edges:
     """Closures between places that are near each other by the poses as they are, every `spacing` metres of way.
 
     closures : found before; the same visit is not closed twice.  failed : guesses from which a match failed; they are
     not tried again, and new ones are added.
-    wide : (n,) key scans for which, and only for them, a wider search is made where the match from there fails.
+    graph : all edges; with them a wider search is made, for places that they leave far apart.
     """
     found, targets = [no_edges()], dict[int, Target]()
     known = set(zip(closures.second.tolist(), (closures.first // TARGET_KEYS).tolist(), strict=True))
-    for here, before in _candidates(look, spacing):
+    candidates = near_candidates(look, spacing) if graph is None else far_candidates(look, spacing, graph)
+    for here, before, span in candidates:
         visit = before // TARGET_KEYS
-        if known & {(here, visit - 1), (here, visit), (here, visit + 1)} or (wide is not None and not wide[here]):
+        if known & {(here, visit - 1), (here, visit), (here, visit + 1)}:
             continue
         guess = se2.between(look.poses[before], look.poses[here])
-        if wide is None and (before, here) in failed and _alike(guess, failed[before, here]):
+        if graph is None and (before, here) in failed and _alike(guess, failed[before, here]):
             continue
         if before not in targets:
             if len(targets) == KEPT:
                 targets.clear()
             targets[before] = target_map(look, before)
-        source = source_map(look, here)
-        span = float(_reach(look.way[here] - look.way[before]))
-        closure = register(source, targets[before], guess, look.noise, span, 0.0 if wide is None else WIDE_TURN)
+        closure = revisit(look, targets[before], before, here, guess, span, 0.0 if graph is None else WIDE_TURN)
         if closure is None:
             failed[before, here] = guess
         else:
@@ -243,25 +226,3 @@ def _supported(look: Search, found: Edges) -> NDArray[np.bool_]:
         there = se2.compose(moved[k], se2.between(look.poses[found.second[k]], look.poses[found.second[near]]))
         out[k] = bool(np.any(agree(there, moved[near])))
     return out
-
-
-def _reach(way: Array) -> Array:
-    return np.minimum(REACH + DRIFT * way, MOST_REACH)
-
-
-def _candidates(look: Search, spacing: float) -> Iterator[tuple[int, int]]:
-    """Pairs (here, before): every `spacing` metres of way, the nearest key scan of the nearest earlier visits."""
-    next_way = 0.0
-    for here in range(len(look.poses)):
-        if look.way[here] < next_way:
-            continue
-        next_way = look.way[here] + spacing
-        since = look.way[here] - look.way[:here]
-        distance = np.hypot(*(look.poses[:here, :2] - look.poses[here, :2]).T)
-        near = np.flatnonzero((since > LEAST_WAY) & (distance < _reach(since)))
-        if len(near) == 0:
-            continue
-        visits = np.split(near, np.flatnonzero(np.diff(look.way[near]) > 2 * REACH) + 1)
-        nearest = sorted((visit[np.argmin(distance[visit])] for visit in visits), key=lambda j: distance[j])
-        for before in nearest[:PASSES]:
-            yield here, int(before)

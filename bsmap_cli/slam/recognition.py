@@ -10,13 +10,14 @@ from bsmap_cli.model import Array, IntArray
 from bsmap_cli.slam.matching import OrientedPoints
 from bsmap_cli.slam.posegraph import Edges
 from bsmap_cli.slam.submaps import (
+    BOLD,
     SOURCE_KEYS,
     TARGET_KEYS,
     Search,
     agree,
     closure_edge,
     no_edges,
-    register,
+    revisit,
     source_map,
     target_map,
 )
@@ -60,10 +61,8 @@ def _witness(look: Search, here: int, pose: Array) -> Edges | None:
     before = int(np.argmin(distance))
     if distance[before] > REACH:
         return None
-    target = target_map(look, before)
-    source = source_map(look, here)
     guess = se2.between(look.poses[before], pose)
-    seen = register(source, target, guess, look.noise, 0.0, 0.0)
+    seen = revisit(look, target_map(look, before), before, here, guess, *BOLD)
     return closure_edge(before, here, seen) if seen is not None and agree(guess, seen.pose) else None
 
 
@@ -121,11 +120,12 @@ def _recognise(look: Search, start: int, after: int) -> Edges:
         for k in np.argsort(apart, kind="stable")[:ALIKE].tolist():
             turns = likely_turns(source.normal, maps[k].points.normal)
             guesses = [np.array([0.0, 0.0, turn]) for turn in turns]
-            matches = [register(source, maps[k], guess, look.noise, PLACE_SPAN, TURN_STEP) for guess in guesses]
+            place = int(places[k])
+            matches = [revisit(look, maps[k], place, key, guess, PLACE_SPAN, TURN_STEP) for guess in guesses]
             best = max((m for m in matches if m is not None), key=lambda m: m.inliers, default=None)
             if best is None:
                 continue
-            closure = closure_edge(int(places[k]), key, best)
+            closure = closure_edge(place, key, best)
             others = witnesses(look, closure)
             if len(others.first):
                 return joined([closure, others])

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from bsmap_cli.core import se2
 from bsmap_cli.core.table import joined, take
-from bsmap_cli.model import Array
+from bsmap_cli.model import Array, IntArray
 from bsmap_cli.slam.matching import (
     LEAST_REACH,
     SAME_WAY,
@@ -21,12 +21,14 @@ from bsmap_cli.slam.matching import (
     search,
 )
 from bsmap_cli.slam.posegraph import Edges
+from bsmap_cli.slam.visibility import View, Views, Visit, contradicting
 
-AGREEMENT = 0.7
-"""Share of points that must lie on the other map."""
+AGREEMENT, LEAST_AGREEMENT, CONTRADICTION = 0.7, 0.5, 0.07
+"""Shares of points that must lie on the other map; the lesser one where beams are asked too, which then may pass
+through no more than the last share of the points."""
 SOURCE_KEYS, TARGET_KEYS = 5, 10
 """Key scans before and after that make the small maps."""
-SOURCE_POINTS = 150
+SOURCE_POINTS, TARGET_POINTS = 150, 600
 CLOSURE_FLOOR = (0.02, 0.02, 0.005)
 """Standard deviations of a closure beside that of the match: metres, metres, radians."""
 WIDTH, CHANCE = 0.05, 2.0
@@ -39,13 +41,15 @@ class Search(NamedTuple):
     """What the search for loops looks at.
 
     points : of each key scan, in base_link.  poses : (n, 3).  way : (n,) metres driven to each.  noise : metres, of a
-    point's distance to the map.
+    point's distance to the map.  keys : (n,) numbers of the scans.  views : of the laser.
     """
 
     points: list[OrientedPoints]
     poses: Array
     way: Array
     noise: float
+    keys: IntArray
+    views: Views
 
 
 def no_edges() -> Edges:
@@ -85,24 +89,62 @@ def small_map(look: Search, centre: int, keys: Sequence[int], step: int = 1) -> 
 
 
 def register(
-    source: OrientedPoints, target: Target, guess: Array, noise: float, span: float, turn: float
+    source: OrientedPoints,
+    target: Target,
+    guess: Array,
+    noise: float,
+    span: float,
+    turn: float,
+    least: float = AGREEMENT,
 ) -> Match | None:
     """Match of two small maps, from the guess, with what it knows surely; None where they do not agree.
 
     span, turn : metres and radians about the guess that are searched where the match from there fails; no turn: none.
+    least : share of the source's points that must lie on the target.
     """
     loose = np.diag([0.01, 0.01, 0.25])
     found = match(source, target, guess, loose, noise, reach=1.0)
-    if found.inliers < AGREEMENT and turn == 0.0:
+    if found.inliers < least and turn == 0.0:
         return None
-    starts = [] if found.inliers >= AGREEMENT else search(source, target, guess, span, turn)
+    starts = [] if found.inliers >= AGREEMENT or turn == 0.0 else search(source, target, guess, span, turn)
     for start in starts:
         coarse = match(source, target, start, loose, noise, max(0.5, span / 6))
         if coarse.inliers > found.inliers:
             found = coarse
-    if found.inliers < AGREEMENT:
+    if found.inliers < least:
         return None
     return found._replace(information=sure_information(source, target, found.pose, noise))
+
+
+def revisit(
+    look: Search, target: Target, first: int, second: int, guess: Array, span: float, turn: float
+) -> Match | None:
+    """Match of what was seen about the second key scan to the `target`, what was seen about the first one.
+
+    Where it moves the trajectory far, or few points match, beams must bear it out: one corridor looks like another,
+    but what stands in its doorways does not, and beams of the one pass through it in the other.
+    """
+    source = source_map(look, second)
+    least = AGREEMENT if turn else LEAST_AGREEMENT  # the wider the search, the more looks alike by chance
+    found = register(source, target, guess, look.noise, span, turn, least)
+    stays = found is not None and agree(found.pose, se2.between(look.poses[first], look.poses[second]))
+    if found is None or (found.inliers >= AGREEMENT and stays):
+        return found
+    before = Visit(thinned(target.points), _views(look, np.zeros(3), first, TARGET_KEYS))
+    now = Visit(source.moved(found.pose), _views(look, found.pose, second, SOURCE_KEYS))
+    return found if contradicting(before, now, look.views, look.noise) <= CONTRADICTION else None
+
+
+def thinned(points: OrientedPoints) -> OrientedPoints:
+    """About TARGET_POINTS of the points."""
+    return take(points, slice(None, None, max(1, len(points.xy) // TARGET_POINTS)))
+
+
+def _views(look: Search, pose: Array, centre: int, half: int) -> list[View]:
+    """Views of the key scans about one, in the frame in which that one's `pose` (3,) is given."""
+    keys = list(around(centre, half, len(look.poses)))
+    placed = se2.compose(pose, se2.between(look.poses[centre], look.poses[keys]))
+    return [look.views.view(int(look.keys[j]), p) for j, p in zip(keys, placed, strict=True)]
 
 
 def sure_information(source: OrientedPoints, target: Target, pose: Array, noise: float) -> Array:

@@ -15,7 +15,6 @@ from bsmap_cli.params import SlamParams
 from bsmap_cli.slam.matching import (
     Match,
     OrientedPoints,
-    Target,
     make_target,
     match,
     oriented_points,
@@ -33,16 +32,23 @@ from bsmap_cli.slam.motion import (
 from bsmap_cli.slam.moving import Watch
 from bsmap_cli.slam.posegraph import Edges
 from bsmap_cli.slam.segments import scan_batches
+from bsmap_cli.slam.visibility import LocalMap, Views, agreeing
 from bsmap_cli.track import Track
 
 WINDOW = 10
 """Key scans that make the local map: enough to reach behind a robot that sees 180 degrees."""
-GOOD, WEAK, FAR = 0.75, 0.5, 16.0
-"""Shares of points on the map: below the first one a wider search is worth its time; below the second, or below the
-first so far from the prediction (squared Mahalanobis distance), the match is not believed and the prediction stands."""
+GOOD, WEAK, NEAR, FAR = 0.75, 0.5, 9.0, 16.0
+"""Shares on which scan and map agree, and squared distances from the prediction, in standard deviations.
+
+Below the first share, or not near, a wider search is worth its time; below the second, or below the first and far, the
+match is not believed and the prediction stands."""
+DEPARTURE_COST = 0.1
+"""Share that a match must agree more when its squared distance from the prediction is e times as large: a slip may be
+of any size."""
 MATCH_FLOOR = np.array([0.003, 0.003, 0.0015])
 """Metres and radians that a match is off at the least, for walls are rough."""
-MOST_POINTS = 400
+MOST_POINTS, CLOSE_REACH = 400, 0.3
+"""Points of a scan; metres within which they pair where the prediction is trusted."""
 JUMP, GAP, STILL = (0.5, 0.5), 10.0, 0.01
 """Metres and radians of odometry beyond what speed allows, and seconds, after which a robot may be anywhere; metres
 and radians that are no motion."""
@@ -59,6 +65,7 @@ class Tracking(NamedTuple):
     weak : (k,) key scans whose match failed, so that their edge holds no more than the motion prior.
     adrift : (k,) key scans before which nothing tells the motion: no odometry, a jump of it, or a long gap.
     odometry_scale : metres of way for a metre of odometry.  matched : (n,) scans that a good match placed.
+    views : of the laser.
     """
 
     poses: Array
@@ -70,19 +77,21 @@ class Tracking(NamedTuple):
     adrift: NDArray[np.bool_]
     odometry_scale: float
     matched: NDArray[np.bool_]
+    views: Views
 
 
 def track_scans(log: ScanLog, range_sigma: float, params: SlamParams, track: Track) -> Tracking:
     """Poses of all scans by matching each to the local map."""
     n = len(log.horizontal.time_ns)
     poses = np.zeros((n, 3))
-    keys, key_points, priors, by_match, inliers = [0], [], [], [], [1.0]
+    keys, key_points, priors, by_match, shares, agreed = [0], [], [], [], [1.0], [1.0]
     last, before, scale, matched = 0, 0, OdometryScale(), np.zeros(n, bool)
     noise = match_noise(range_sigma)
     scans = _points_of_scans(log, range_sigma)
     key_points.append(next(scans))
-    placed, watch = [key_points[0]], Watch(log.horizontal)
-    moves = [watch.add(0, poses[0], placed[0], True)]
+    views = Views(log.horizontal)
+    placed, watch, seen = [key_points[0]], Watch(views), [views.view(0, poses[0])]
+    moves = [watch.add(seen[0], placed[0], True)]
     broken = adrift(log, np.arange(n)) if log.odometry is not None else np.zeros(n, bool)
     target = make_target(placed[0])
     for k, points in enumerate(scans, 1):
@@ -92,31 +101,37 @@ def track_scans(log: ScanLog, range_sigma: float, params: SlamParams, track: Tra
         poses[k] = predicted
         if log.odometry is not None and not _moved(prior.increment, params.match_distance, params.match_angle):
             continue
-        found = _match(points, target, predicted, prior, noise)
+        found, agrees = _match(k, points, LocalMap(target, seen, views), predicted, prior, noise)
         poses[k], matched[k] = found.pose, found.inliers >= GOOD
         before, last = last, k
         step = se2.between(poses[keys[-1]], poses[k])
         if not _moved(step, params.key_distance, params.key_angle):
             continue
-        inliers.append(found.inliers)
+        shares.append(found.inliers)
+        agreed.append(agrees)
         by_match.append(_in_frame_of(predicted, found.information))
         priors.append(prior.noise)
-        if log.odometry is not None and min(inliers[-2:]) >= GOOD:
+        if log.odometry is not None and min(shares[-2:]) >= GOOD:
             scale = scale.seen(se2.between(log.odometry[keys[-1]], log.odometry[k]), step, by_match[-1])
         keys.append(k)
         key_points.append(points)
         placed = [*placed[-WINDOW:], points.moved(poses[k])]
         if broken[keys[-2] + 1 : k + 1].any():
-            watch = Watch(log.horizontal)  # what was seen before may be of another place
-        moves.append(watch.add(k, poses[k], placed[-1], found.inliers >= WEAK))
-        target = make_target(joined([_standing(placed[j - len(keys)], moves[j]) for j in _local(inliers)]))
-    weak = np.array(inliers) < WEAK
+            watch, seen = Watch(views), []  # what was seen before may be of another place
+        view = views.view(k, poses[k])
+        moves.append(watch.add(view, placed[-1], agrees >= WEAK))
+        if agrees >= WEAK:
+            seen = [*seen[1 - WINDOW :], view]
+        target = make_target(joined([_standing(placed[j - len(keys)], moves[j]) for j in _local(agreed)]))
+    weak = np.array(agreed) < WEAK
     match_information = np.array(by_match).reshape(-1, 3, 3)
     information = _edge_information(match_information, np.array(priors).reshape(-1, 3, 3), weak[1:])
-    chain = _chain(poses[keys], information, np.array(inliers))
+    chain = _chain(poses[keys], information, weak, np.array(shares) < GOOD)
     drifts = adrift(log, np.array(keys))
     key_points = [_standing(*both) for both in zip(key_points, moves, strict=True)]
-    return Tracking(poses, np.array(keys), key_points, chain, match_information, weak, drifts, scale.value, matched)
+    return Tracking(
+        poses, np.array(keys), key_points, chain, match_information, weak, drifts, scale.value, matched, views
+    )
 
 
 def _standing(points: OrientedPoints, moves: NDArray[np.bool_]) -> OrientedPoints:
@@ -141,13 +156,13 @@ def adrift(log: ScanLog, keys: IntArray) -> NDArray[np.bool_]:
     return np.concatenate([[False], jump | (gap & ~goes_on)])
 
 
-def _local(inliers: list[float]) -> list[int]:
+def _local(agreed: list[float]) -> list[int]:
     """Last key scans that make the local map: a single failed one stays out, for its place is doubtful.
 
     Of several in a row, as where the robot turns into a room that it has not seen, each helps to place the next.
     """
-    failed = [False, *(share < WEAK for share in inliers[-WINDOW - 1 :]), False]
-    first = len(inliers) - (len(failed) - 2)
+    failed = [False, *(share < WEAK for share in agreed[-WINDOW - 1 :]), False]
+    first = len(agreed) - (len(failed) - 2)
     alone = [
         now and not before and not after for before, now, after in zip(failed, failed[1:], failed[2:], strict=False)
     ]
@@ -173,25 +188,49 @@ def _motion(log: ScanLog, poses: Array, before: int, last: int, k: int, params: 
     return constant_velocity(se2.between(poses[before], poses[last]), earlier, seconds, params)
 
 
-def _match(points: OrientedPoints, target: Target, predicted: Array, prior: Motion, noise: float) -> Match:
+class _Placed(NamedTuple):
+    """A match, and the share of what both could see on which scan and map agree."""
+
+    match: Match
+    agreement: float
+
+
+def _match(
+    scan: int, points: OrientedPoints, local: LocalMap, predicted: Array, prior: Motion, noise: float
+) -> _Placed:
     """Match from the prediction; where that is poor, from the best places of a wider search; else the prediction."""
     spread = np.sqrt(prior.noise.diagonal()) + LEAST_SPREAD
     information = np.zeros((3, 3))
     np.fill_diagonal(information, spread**-2)
     place, _, heading = spread.tolist()
     reach = min(max(0.2 + 4 * place + 2 * heading, 0.3), 1.0)
-    best = match(points, target, predicted, information, noise, reach)
-    if best.inliers >= GOOD and _departure(best, predicted, spread) < 9.0:
-        return best
+    best = match(points, local.target, predicted, information, noise, reach)
+    near = _departure(best, predicted, spread) < NEAR
+    if near and best.inliers >= GOOD:
+        return _Placed(best, best.inliers)
+
+    def placed(found: Match) -> _Placed:
+        """With what nobody saw before left out; but far from the prediction that is no excuse."""
+        agreement = agreeing(found, scan, points, local, noise)
+        far = _departure(found, predicted, spread) >= FAR
+        return _Placed(found, min(agreement, found.inliers) if far else agreement)
+
+    chosen = placed(best)
+    if near and chosen.agreement >= GOOD:
+        return chosen
+    # Pairs from far away draw a robot that sees much of what is new to where it was before.
+    close = placed(match(points, local.target, predicted, information, noise, CLOSE_REACH))
+    if _worth(close, predicted, spread) > _worth(chosen, predicted, spread):
+        chosen = close
     span, turn = min(0.3 + 3 * place, 1.5), min(0.12 + 3 * heading, 1.0)
     loose = information / 100
-    for start in search(points, target, predicted, span, turn):
-        coarse = match(points, target, start, loose, noise, 0.5)
-        fine = match(points, target, coarse.pose, loose, noise, 0.15)
-        if _worth(fine, predicted, spread) > _worth(best, predicted, spread):
-            best = fine
-    credible = best.inliers >= (WEAK if _departure(best, predicted, spread) < FAR else GOOD)
-    return best if credible else Match(predicted, np.zeros((3, 3)), 0.0, 0.0)
+    for start in search(points, local.target, predicted, span, turn):
+        coarse = match(points, local.target, start, loose, noise, 0.5)
+        fine = placed(match(points, local.target, coarse.pose, loose, noise, 0.15))
+        if _worth(fine, predicted, spread) > _worth(chosen, predicted, spread):
+            chosen = fine
+    credible = chosen.agreement >= (WEAK if _departure(chosen.match, predicted, spread) < FAR else GOOD)
+    return chosen if credible else _Placed(Match(predicted, np.zeros((3, 3)), 0.0, 0.0), 0.0)
 
 
 def _departure(found: Match, predicted: Array, spread: Array) -> float:
@@ -200,13 +239,13 @@ def _departure(found: Match, predicted: Array, spread: Array) -> float:
     return (x / a) ** 2 + (y / b) ** 2 + (se2.wrap_one(theta) / c) ** 2
 
 
-def _worth(found: Match, predicted: Array, spread: Array) -> float:
-    """Share of points on the map, less what leaving the prediction costs.
+def _worth(found: _Placed, predicted: Array, spread: Array) -> float:
+    """Share on which scan and map agree, less what leaving the prediction costs.
 
     A robot that turns where it has not been sees little that it knows: only a much better match may contradict the
-    prediction, and then (a slipping wheel, lost scans) how far it does so no longer matters.
+    prediction, and then (a slipping wheel, lost scans) how far it does so matters less and less.
     """
-    return found.inliers - 0.02 * min(_departure(found, predicted, spread), 15.0)
+    return found.agreement - DEPARTURE_COST * math.log1p(_departure(found.match, predicted, spread))
 
 
 def _in_frame_of(pose: Array, information: Array) -> Array:
@@ -231,20 +270,19 @@ def limited(information: Array, floor: Array) -> Array:
     return (both + np.swapaxes(both, -1, -2)) / 2
 
 
-def _chain(poses: Array, information: Array, inliers: Array) -> Edges:
+def _chain(poses: Array, information: Array, failed: NDArray[np.bool_], poor: NDArray[np.bool_]) -> Edges:
     """Edges between key scans: from the one before or, past a single failed one, from the one before that.
 
     For a match is one to the map of all. A failed one hangs on the last sound one: a single bad reading of the odometry
     may be all there is to it. Edges of a poor match may give way where loops contradict them.
     """
     second = np.arange(1, len(poses))
-    failed = inliers < WEAK
     before = np.concatenate([[False], failed])  # shifted by one, so that there is one before the first
     alone = failed[second - 1] & ~before[second - 1] & ~failed[second]
     sound = np.maximum.accumulate(np.where(failed, 0, np.arange(len(poses))))
     first = np.where(failed[second], sound[second - 1], second - 1 - alone)
     relative = se2.between(poses[first], poses[second])
-    return Edges(first, second, relative, information, inliers[1:] < GOOD)
+    return Edges(first, second, relative, information, poor[1:])
 
 
 def _points_of_scans(log: ScanLog, range_sigma: float) -> Iterator[OrientedPoints]:

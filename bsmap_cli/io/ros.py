@@ -3,6 +3,7 @@
 Types and their definitions come from rosbags' type store (ROS 2 Humble), (de)serialised as CDR.
 """
 
+import math
 from collections.abc import Sequence
 from functools import cache
 from typing import Any
@@ -101,17 +102,31 @@ def matrix_from_quaternion(q: ArrayLike) -> Array:
 
 def transform_message(matrix: Array, time_ns: int, parent: str, child: str) -> Any:
     """geometry_msgs/TransformStamped that maps `child` coordinates to `parent`; matrix (4, 4)."""
-    x, y, z, w = quaternion_from_matrix(matrix[:3, :3]).tolist()
+    return _transform(matrix[:3, 3].tolist(), quaternion_from_matrix(matrix[:3, :3]).tolist(), time_ns, parent, child)
+
+
+def planar_transform_message(pose: Array, time_ns: int, parent: str, child: str) -> Any:
+    """The same for a planar pose x, y, theta."""
+    x, y, theta = pose.tolist()
+    return _transform((x, y, 0.0), _about_z(theta), time_ns, parent, child)
+
+
+def _transform(translation: Sequence[float], quaternion: Sequence[float], time_ns: int, parent: str, child: str) -> Any:
     return make(
         "geometry_msgs/msg/TransformStamped",
         header=header(time_ns, parent),
         child_frame_id=child,
         transform=make(
             "geometry_msgs/msg/Transform",
-            translation=make("geometry_msgs/msg/Vector3", **dict(zip("xyz", matrix[:3, 3].tolist(), strict=True))),
-            rotation=make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+            translation=make("geometry_msgs/msg/Vector3", **dict(zip("xyz", translation, strict=True))),
+            rotation=make("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", quaternion, strict=True))),
         ),
     )
+
+
+def _about_z(theta: float) -> tuple[float, float, float, float]:
+    """Quaternion x, y, z, w of a rotation by theta, radians."""
+    return 0.0, 0.0, math.sin(theta / 2), math.cos(theta / 2)
 
 
 def tf_message(transforms: Sequence[Any]) -> Any:
@@ -134,9 +149,7 @@ def pose_message(pose: ArrayLike) -> Any:
     return make(
         "geometry_msgs/msg/Pose",
         position=make("geometry_msgs/msg/Point", x=x, y=y, z=0.0),
-        orientation=make(
-            "geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=float(np.sin(theta / 2)), w=float(np.cos(theta / 2))
-        ),
+        orientation=make("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", _about_z(theta), strict=True))),
     )
 
 

@@ -141,16 +141,10 @@ def _steps(slam: SlamMap) -> Iterator[_Messages]:
         stamped = ros.make(
             ros.POSE_WITH_COVARIANCE, header=ros.header(t, "map"), pose=ros.pose_with_covariance(pose, covariance)
         )
-        tf = ros.tf_message([ros.transform_message(planar_matrix(pose), t, "map", "base_link")])
+        tf = ros.tf_message([ros.planar_transform_message(pose, t, "map", "base_link")])
         yield _Messages(
             t, (("/pose", stamped), ("/tf", tf), ("/bsmap/steps", ros.numbers_message(numbers[k], STEP_COLUMNS)))
         )
-
-
-def planar_matrix(pose: Array) -> Array:
-    """Matrix (4, 4) of a planar pose (3,) x, y, theta."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    return np.array([[c, -s, 0, pose[0]], [s, c, 0, pose[1]], [0, 0, 1, 0], [0, 0, 0, 1.0]])
 
 
 def _vertical_scans(vertical: LaserScans | None) -> Iterator[_Messages]:

@@ -1,6 +1,7 @@
 """What key scans saw through: whether a place contradicts a scan, or was only never seen before."""
 
 import cmath
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,8 @@ from bsmap_cli.slam.matching import (
 ASIDE, SHORT = 0.03, 0.4
 """Radians to each side of a beam, and metres before its end, that count as free no more: poses and edges are not exact.
 """
+KEPT = 1000
+"""Scans whose free ranges are kept, for places are looked at many times."""
 LEAST_KNOWN = 0.3
 """Share of a scan's points on the map below which too little speaks for a place, whatever else could be seen."""
 
@@ -46,12 +49,17 @@ class Views:
 
     def __init__(self, scans: LaserScans) -> None:
         self._scans, self._mount = scans, se2.from_matrix(scans.mount)
+        self._ranges = lru_cache(KEPT)(self._ranges_of)
 
     def view(self, scan: int, pose: Array) -> View:
         """Of a scan with base_link at `pose` (3,)."""
         x, y, theta = se2.compose(pose, self._mount).tolist()
+        return View(complex(x, y), cmath.exp(-1j * theta), *self._ranges(scan))
+
+    def _ranges_of(self, scan: int) -> tuple[Array, Array]:
+        """Ranges and free ranges of a view."""
         ranges = np.nan_to_num(np.append(self._scans.ranges[scan], 0.0))
-        return View(complex(x, y), cmath.exp(-1j * theta), ranges, free_ranges(ranges, self._scans.angle_increment))
+        return ranges, free_ranges(ranges, self._scans.angle_increment)
 
     def through(self, at: NDArray[np.complex128], views: list[View]) -> NDArray[np.bool_]:
         """(v, n) whether points (n,) in map, as complex numbers, lie where beams of the scans passed."""

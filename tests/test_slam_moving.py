@@ -77,3 +77,15 @@ def test_company_in_a_bare_corridor_does_not_hold_the_robot_back(seed):
     assert away[tracking.keys].max() < 0.5
     bodies = [np.abs(points.xy[:, 1] - 0.5) < 0.2 for points in tracking.points[3:-8]]
     assert np.concatenate(bodies).mean() < 0.01
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_company_all_round_does_not_take_the_robot_along(seed):
+    """Matched to six who walk with it the robot would stand; what odometry tells is less wrong by far."""
+    way = along([(3.0, 0.0), (15.0, 0.0)], 0.07)
+    log = log_of(with_company(way, [1.0, 1.6, 2.4, -1.0, -1.6, -2.4]), way, seed)
+    log.horizontal.ranges[log.horizontal.ranges > 8.0] = np.nan
+    tracking = track_scans(log, SIGMA, SlamParams(), silent)
+    away = np.hypot(*(tracking.poses - in_first(way))[:, :2].T)
+    assert len(tracking.keys) > 30
+    assert away[tracking.keys].max() < 1.2

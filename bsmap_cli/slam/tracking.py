@@ -49,6 +49,8 @@ MATCH_FLOOR = np.array([0.003, 0.003, 0.0015])
 """Metres and radians that a match is off at the least, for walls are rough."""
 MOST_POINTS, CLOSE_REACH = 400, 0.3
 """Points of a scan; metres within which they pair where the prediction is trusted."""
+FEW, STIFF = 0.15, 0.002
+"""Share of normals along a corridor that are too few to contradict odometry there; metres that hold a match to it."""
 JUMP, GAP, STILL = (0.5, 0.5), 10.0, 0.01
 """Metres and radians of odometry beyond what speed allows, and seconds, after which a robot may be anywhere; metres
 and radians that are no motion."""
@@ -101,7 +103,12 @@ def track_scans(log: ScanLog, range_sigma: float, params: SlamParams, track: Tra
         poses[k] = predicted
         if log.odometry is not None and not _moved(prior.increment, params.match_distance, params.match_angle):
             continue
-        found, agrees = _match(k, points, LocalMap(target, seen, views), predicted, prior, noise)
+        local = LocalMap(target, seen, views)
+        placing = _match(k, points, local, predicted, prior, noise)
+        if log.odometry is not None:
+            told = odometry_motion(log.odometry[keys[-1]], log.odometry[k], params, scale.value)
+            placing = _not_drawn(placing, k, points, local, poses[keys[-1]], told, noise)
+        found, agrees = placing
         poses[k], matched[k] = found.pose, found.inliers >= GOOD
         before, last = last, k
         step = se2.between(poses[keys[-1]], poses[k])
@@ -231,6 +238,38 @@ def _match(
             chosen = fine
     credible = chosen.agreement >= (WEAK if _departure(chosen.match, predicted, spread) < FAR else GOOD)
     return chosen if credible else _Placed(Match(predicted, np.zeros((3, 3)), 0.0, 0.0), 0.0)
+
+
+def _not_drawn(
+    placed: _Placed, scan: int, points: OrientedPoints, local: LocalMap, key: Array, told: Motion, noise: float
+) -> _Placed:
+    """The match; or, if few points draw it far from where odometry has the robot, the one where odometry is right.
+
+    Who walks beside a robot between bare walls looks like a place that it does not leave.
+    told : motion since the last key scan, which was at `key` (3,).
+    """
+    predicted, spread = se2.compose(key, told.increment), np.sqrt(told.noise.diagonal()) + LEAST_SPREAD
+    found = placed.match
+    away = (predicted - found.pose)[:2]
+    if away @ away < NEAR * spread[0] ** 2 or not len(points.xy):
+        return placed
+    c, s = math.cos(found.pose[2]), math.sin(found.pose[2])
+    normal = points.normal @ np.array([[c, s], [-s, c]])
+    shares, axes = np.linalg.eigh(normal.T @ normal / len(normal))
+    along = axes[:, 0]
+    if shares[0] > FEW or (along @ away) ** 2 < NEAR * spread[0] ** 2:
+        return placed
+    stiff = np.zeros((3, 3))
+    stiff[:2, :2] = np.outer(along, along) / STIFF**2
+    start = found.pose.copy()
+    start[:2] += along * (along @ away)
+    held = match(points, local.target, start, stiff, noise, CLOSE_REACH)
+    known = held.information[:, :2] @ along
+    least = max(float(along @ known[:2]), 1e-9)
+    held = held._replace(information=held.information - np.outer(known, known) / least)
+    other = _Placed(held, agreeing(held, scan, points, local, noise))
+    better = _worth(other, predicted, spread) > _worth(placed, predicted, spread)
+    return other if better and other.agreement >= GOOD else placed
 
 
 def _departure(found: Match, predicted: Array, spread: Array) -> float:

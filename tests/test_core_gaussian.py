@@ -6,6 +6,7 @@ from scipy.stats import chi2, multivariate_normal
 
 from bsmap_cli.core.gaussian import (
     chi2_gate,
+    noncentrality,
     pack,
     product,
     rounded_root,
@@ -146,3 +147,21 @@ def test_squared_distance_in_two_dimensions_is_that_in_any():
     half = rng.normal(size=(20, 2, 2))
     covariance, difference = half @ half.swapaxes(1, 2), rng.normal(size=(20, 2))
     np.testing.assert_allclose(squared_distance_2(difference, covariance), squared_distance(difference, covariance))
+
+
+def test_noncentrality_is_the_mean_of_what_may_be():
+    for square in (0.0, 1.0, 30.0, 900.0):
+        assert noncentrality(square, 2.0) == pytest.approx(square + 2.0)
+    assert noncentrality(1e4, 6.0) == pytest.approx(9998.0, abs=0.1)
+    values = [noncentrality(square, 6.0) for square in np.linspace(0.0, 60.0, 30)]
+    assert np.all(np.diff(values) > 0.0)
+
+
+def test_noncentrality_of_many_chi_squares_is_right_in_the_mean():
+    rng = np.random.default_rng(0)
+    means = rng.uniform(0.0, 60.0, 20000)
+    squares = rng.noncentral_chisquare(6.0, means)
+    found = np.array([noncentrality(square, 6.0) for square in squares])
+    for low, high in ((5.0, 15.0), (15.0, 30.0), (30.0, 45.0)):
+        some = (squares > low) & (squares < high)
+        assert found[some].mean() == pytest.approx(means[some].mean(), rel=0.1)

@@ -7,7 +7,7 @@ from bsmap_cli.core.bspline import clamped_knots, inner_knots, open_knots
 from bsmap_cli.fit import selection
 from bsmap_cli.fit.blocks import Blocks
 from bsmap_cli.fit.heights import CylinderBase, HeightField, Knots, PlaneBase, basis_matrix, evaluate, least_knots
-from bsmap_cli.fit.selection import PRICE, fit_heights, refit, told
+from bsmap_cli.fit.selection import PRICE, fit_heights, refit
 
 SIGMA = 0.01
 PLANE = PlaneBase(np.zeros(3), np.eye(3))
@@ -86,13 +86,49 @@ def test_knots_that_new_data_pay_for_are_added():
     assert now - chosen.criterion < 0.05 * (as_it_is - chosen.criterion)
 
 
+def told_share(height, seed, knots):
+    """Share of the equations' information that a fit on such knots tells."""
+    blocks = blocks_of(height, seed)
+    fitted = refit(field_on(knots), blocks, SIGMA)
+    data = selection._linearise(fitted.field, blocks, SIGMA)
+    raw = selection._solve(knots, data).information
+    np.testing.assert_allclose(fitted.information, raw * (share := fitted.information[0, 0] / raw[0, 0]), rtol=1e-3)
+    return share
+
+
 def test_the_least_surface_tells_all_it_knows_and_others_less():
-    flat = least_knots(PLANE, LOW, HIGH)
-    assert told(flat, flat) == 1.0
-    shares = [told(Knots(2, 1, clamped_knots(2, np.arange(1, n) / n), open_knots(1)), flat) for n in (1, 2, 4, 8)]
-    left_out = np.array([6, 7, 9, 13]) * PRICE / 3.0
-    np.testing.assert_allclose(shares, [n / (n + more) for n, more in zip((6, 8, 12, 20), left_out, strict=True)])
-    assert fit_heights(blocks_of(lambda s, t: 0.1 * s), PLANE, LOW, HIGH, SIGMA).field.knots.size == 4
+    assert told_share(lambda s, t: 0.1 * s, 0, least_knots(PLANE, LOW, HIGH)) == pytest.approx(1.0)
+    assert 0.2 < told_share(lambda s, t: 0.1 * s**2, 0, Knots(2, 1, open_knots(2), open_knots(1))) < 1.0
+
+
+@pytest.mark.parametrize("height", [lambda s, t: 0.01 * np.sin(3.0 * s), lambda s, t: 0.002 * (s - 2.0) ** 4])
+def test_what_the_knots_leave_out_is_taken_from_what_is_told(height):
+    knots = Knots(2, 1, open_knots(2), open_knots(1))
+    bent = [told_share(height, seed, knots) for seed in range(5)]
+    smooth = [told_share(lambda s, t: 0.1 * s**2, seed, knots) for seed in range(5)]
+    assert max(bent) < 0.2
+    assert np.mean(smooth) > 0.4
+
+
+def test_finer_knots_follow_what_is_even_and_what_is_odd_about_a_span():
+    u = np.linspace(0.0, 1.0, 200)
+    for knots, degree in ((open_knots(2), 2), (open_knots(1), 1)):
+        finer = selection._finer(Knots(degree, 1, knots, open_knots(1)), 0)
+        N = basis_matrix(finer, np.column_stack([u, np.zeros(len(u))]))
+        for order in (degree + 1, degree + 2):
+            wave = np.polynomial.chebyshev.Chebyshev.basis(order, domain=[0.0, 1.0])(u)
+            left = wave - N @ np.linalg.lstsq(N, wave, rcond=None)[0]
+            assert np.sum(left**2) < 0.3 * np.sum(wave**2)
+
+
+def test_knots_are_sought_anew_about_what_was_found():
+    """On far too few knots the first surface lies far from the data."""
+    blocks = blocks_of(lambda s, t: 0.3 * np.sin(3.0 * s))
+    fitted = refit(field_on(Knots(2, 1, open_knots(2), open_knots(1))), blocks, SIGMA, choose=True)
+    data = selection._linearise(fitted.field, blocks, SIGMA)
+    now = selection._solve(fitted.field.knots, data)
+    steps = list(selection._single_steps(now.knots, data, selection._misfit(now.knots, now.heights, data) ** 2))
+    assert min(selection._solve(step, data).criterion for step in steps) > now.criterion - 1e-6
 
 
 def test_covariance_of_bent_faces_holds_their_errors():
@@ -106,6 +142,7 @@ def test_covariance_of_bent_faces_holds_their_errors():
         fitted = fit_heights(blocks, PLANE, LOW, HIGH, SIGMA)
         if fitted.field.knots.size == 4:
             continue
+        fitted = refit(fitted.field, blocks, SIGMA)
         uv = (blocks.points[:, :2] - LOW) / (HIGH - LOW)
         error = evaluate(fitted.field, uv)[0] - height(*blocks.points[:, :2].T)
         N = basis_matrix(fitted.field.knots, uv)

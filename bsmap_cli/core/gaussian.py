@@ -19,6 +19,23 @@ def chi2_gate(probability: float, dof: int) -> float:
     return float(chdtri(dof, 1.0 - probability))
 
 
+def noncentrality(square: float, dof: float) -> float:
+    """Mean of what the noncentrality of a chi square of `dof` degrees of freedom, seen as `square`, may be.
+
+    All of them alike likely before. The density is a Poisson mixture of central ones (Johnson, Kotz and Balakrishnan,
+    Continuous Univariate Distributions 2, chapter 29), term by term integrable: 2 (1 + mean of j), weights
+    (square / 2)^j / Gamma(dof / 2 + j).
+    """
+    half, weight, total, mean, j = 0.5 * square, 1.0, 1.0, 0.0, 0
+    while weight > 1e-9 * total or 0.5 * dof + j < half:
+        weight *= half / (0.5 * dof + j)
+        j += 1
+        total, mean = total + weight, mean + j * weight
+        if total > 1e200:
+            weight, total, mean = weight / total, 1.0, mean / total
+    return 2.0 * (1.0 + mean / total)
+
+
 def pack(matrices: Array) -> Array:
     """Symmetric matrices (..., 3, 3) as (..., 6): xx, xy, xz, yy, yz, zz."""
     return matrices[..., _ROW, _COLUMN]

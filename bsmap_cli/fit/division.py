@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from bsmap_cli.fit.absorption import absorb
 from bsmap_cli.fit.beams import BeamGrid
+from bsmap_cli.fit.beliefs import believed, scale_left, without_misfits
 from bsmap_cli.fit.blocks import Blocks, make_blocks, single_beams, thinned
 from bsmap_cli.fit.clutter import find_planes
 from bsmap_cli.fit.crossings import find_crossings
 from bsmap_cli.fit.grazing import without_grazed_ends
 from bsmap_cli.fit.heights import Base, Bulge, CylinderBase, HeightField, PlaneBase, evaluate, plane_base
 from bsmap_cli.fit.labels import (
-    Misses,
     Runs,
     adopt,
     enclosed,
@@ -24,7 +24,6 @@ from bsmap_cli.fit.labels import (
     move_breaks,
     runs_of,
     without_alike,
-    without_outliers,
     without_slipped_ends,
 )
 from bsmap_cli.fit.lowmodels import CylinderFrame, fit_cylinder_frame, fit_plane_frame, turned
@@ -40,8 +39,6 @@ FEWEST_BEAMS = 12
 """Of a face; what is smaller is left to the rest."""
 FARTHEST = 1.0
 """Metres by which a face's rectangle may grow towards its creases."""
-BELIEVED = 0.9
-"""Share of its beams that a face must fit."""
 STEEPEST_HEIGHTS = 3.0
 """Slope of the heights of a face over its base, 72 degrees."""
 LITTLE = 0.05
@@ -77,12 +74,14 @@ def find_faces(grid: BeamGrid) -> Faces:
         for k in members:
             labels[pieces.row[k], pieces.start[k] : pieces.stop[k]] = number
     labels = _renumber(labels, grid)
-    fitted = _fit_all(grid, labels, sigma)
+    blocks = blocks_of_faces(grid, labels)
+    fitted = [_fit(grid, labels == k, of_face, sigma) for k, of_face in enumerate(blocks)]
+    noise = sigma * scale_left(fitted, blocks)
     misses = None
     for step in range(ROUNDS):
         fields = [f.field for f in fitted]
         misses = find_misses(grid, labels, fields, before=misses)
-        divided = adopt(grid, without_outliers(misses, sigma), fields, sigma)
+        divided = adopt(grid, without_misfits(grid, misses, sigma, noise), fields, sigma)
         divided = move_breaks(grid, divided, fields, sigma)
         misses = find_misses(grid, divided, fields, misses)
         misses = misses._replace(labels=without_alike(grid, misses, sigma))
@@ -90,23 +89,25 @@ def find_faces(grid: BeamGrid) -> Faces:
         divided = without_grazed_ends(grid, divided, fields, sigma)
         if step < ROUNDS - 1:
             divided = find_planes(grid, divided, sigma)
-            labels, fitted = _fit_changed(grid, labels, divided, fitted, sigma)
+            labels, fitted = _fit_changed(grid, labels, divided, fitted, noise)
             after = absorb(grid, labels, [f.field for f in fitted], sigma)
             if np.any(after != labels):
-                labels, fitted = _fit_changed(grid, labels, fill(grid, after), fitted, sigma)
+                labels, fitted = _fit_changed(grid, labels, fill(grid, after), fitted, noise)
         else:
             labels, kept = _kept(divided, grid)
-            fitted = _refit_all(grid, labels, [fields[k] for k in kept], sigma)
-    labels, kept = _believed(grid, labels, [f.field for f in fitted], misses, sigma)
-    fitted = [fitted[k] for k in kept]
-    fitted = _widened(grid, labels, fitted, sigma)
+            fitted = _refit_all(grid, labels, [fields[k] for k in kept], noise)
+    misses = find_misses(grid, labels, [f.field for f in fitted], before=misses)
+    labels, kept = _kept(fill(grid, believed(grid, misses, sigma, noise)), grid)
+    fitted = _widened(grid, labels, [fitted[k] for k in kept], noise)
+    misses = find_misses(grid, labels, [f.field for f in fitted], before=misses)
+    labels = fill(grid, believed(grid, misses, sigma, noise))
     for number, one in enumerate(fitted):
         points = grid.points[(labels == number) & grid.hit]
         if len(points) < LEAST_BLOCKS * one.field.knots.size or _stands_on_edge(one.field, points):
             labels[labels == number] = -1
     labels = enclosed(grid, on_their_sides(grid, labels, [one.field for one in fitted], sigma))
     labels, kept = _kept(labels, grid)
-    return Faces(labels, [fitted[k] for k in kept], sigma)
+    return Faces(labels, [fitted[k] for k in kept], noise)
 
 
 def _widened(grid: BeamGrid, labels: IntArray, fitted: list[Fitted], sigma: float) -> list[Fitted]:
@@ -131,23 +132,11 @@ def _widened(grid: BeamGrid, labels: IntArray, fitted: list[Fitted], sigma: floa
             low = np.where(low < field.low, low - margin, low)
             high = np.where(high > field.high, high + margin, high)
             field = replace(field, low=low, high=high)
-        if field is not old.field or curved:
-            # Where a face bends both ways, means of beams hide what the beams themselves ask for.
-            old = refit(field, beams if curved else blocks, sigma, choose=curved and min(field.knots.shape) > 2)
+        if field is not old.field or bent[number]:
+            # Means of beams hide what the beams themselves ask for.
+            old = refit(field, beams if curved else blocks, sigma, choose=curved)
         out.append(old)
     return out
-
-
-def _believed(
-    grid: BeamGrid, labels: IntArray, fields: list[HeightField], known: Misses | None, sigma: float
-) -> tuple[IntArray, IntArray]:
-    """Labels without outliers, nor the faces that many beams deny; and the numbers of the others."""
-    final = without_outliers(find_misses(grid, labels, fields, before=known), sigma)
-    for number in range(len(fields)):
-        before, after = (int(np.count_nonzero((a == number) & grid.hit)) for a in (labels, final))
-        if after < BELIEVED * before:
-            final[final == number] = -1
-    return _kept(fill(grid, final), grid)
 
 
 def _stands_on_edge(field: HeightField, points: Array) -> bool:
@@ -191,10 +180,6 @@ def _by_face(blocks: Blocks, runs: Runs, faces: int) -> list[Blocks]:
     blocks = blocks.pick(np.argsort(face.astype(np.int16 if faces < 2**15 else np.int64), kind="stable"))
     ends = np.cumsum(np.bincount(face, minlength=faces)).tolist()
     return [blocks.pick(slice(a, b)) for a, b in itertools.pairwise([0, *ends])]
-
-
-def _fit_all(grid: BeamGrid, labels: IntArray, sigma: float) -> list[Fitted]:
-    return [_fit(grid, labels == k, blocks, sigma) for k, blocks in enumerate(blocks_of_faces(grid, labels))]
 
 
 def _fit_changed(

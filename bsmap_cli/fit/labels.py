@@ -17,12 +17,10 @@ OUTLIER, ADOPTED = 4.5, 3.5
 """Standard deviations beyond which a beam leaves its face, within which one of the rest joins a neighbouring face."""
 SLIPPED = 2.0
 """The same, of noise and flatness together, for the last beam before a jump that misses its face towards the next."""
-ALIKE = ((3, 3), (7, 1))
-"""Scans and beams of neighbourhoods whose misses are added up."""
+ALIKE = (((3, 3), 0.0), ((7, 1), 0.0), ((3, 13), FLATNESS))
+"""Scans and beams of neighbourhoods whose misses are added up, and metres that these may have in common."""
 NEXT = ((-1, 0), (1, 0), (0, -2), (0, -1), (0, 1), (0, 2))
 """Scans and beams from a beam to those that its face may adopt."""
-CHUNK = 20_000
-"""Beams whose neighbourhoods are added up at a time."""
 PASSES = 30
 TOUCHING = 1.0
 """Standard deviations within which two surfaces touch."""
@@ -135,16 +133,16 @@ def without_alike(grid: BeamGrid, misses: Misses, sigma: float) -> IntArray:
     """Labels without the beams that miss their face by less than an outlier, but together with their neighbours.
 
     The side of a recess that is no deeper than the gate of outliers would otherwise be shared out to the faces above
-    and below it.
+    and below it. What many have in common may be the unevenness of a real wall.
     """
     labels = misses.labels
     member = (labels >= 0) & grid.hit
     miss = np.clip(misses.beyond / sigma, -OUTLIER, OUTLIER)
-    own = np.where(member, labels, -1)
     alike = np.zeros(labels.shape, dtype=bool)
-    for window in ALIKE:
-        total, count = _window_sums(own, miss, window)
-        alike |= member & (np.abs(total) > OUTLIER * np.sqrt(count)) & (miss * total > 0.0)
+    for window, uneven in ALIKE:
+        total, count = _window_sums(labels, member, miss, window)
+        most = OUTLIER * np.sqrt(count) + uneven / sigma * count
+        alike |= member & (np.abs(total) > most) & (miss * total > 0.0)
     return np.where(alike, -1, labels)
 
 
@@ -174,22 +172,30 @@ def without_slipped_ends(grid: BeamGrid, misses: Misses, fields: Sequence[Height
     return labels
 
 
-def _window_sums(own: IntArray, values: Array, window: tuple[int, int]) -> tuple[Array, Array]:
-    """(m, n) sums of the values of beams of the same face in a window around each, and their number."""
-    (m, n), reach = own.shape, (window[0] // 2, window[1] // 2)
-    margins = [(r, r) for r in reach]
-    faces, padded = np.pad(own.astype(np.int32), margins, constant_values=-1), np.pad(values, margins)
-    total, count = np.zeros(own.shape), np.zeros(own.shape)
-    step = max(1, CHUNK // n)
-    # So many scans at once stay in the processor's cache.
-    for first in range(0, m, step):
-        rows = slice(first, min(first + step, m))
-        centre = faces[reach[0] :][rows, reach[1] : reach[1] + n]
-        for i, k in itertools.product(range(window[0]), range(window[1])):
-            same = faces[i:][rows, k : k + n] == centre
-            total[rows] += np.where(same, padded[i:][rows, k : k + n], 0.0)
-            count[rows] += same
-    return total, count
+def _window_sums(
+    labels: IntArray, member: NDArray[np.bool_], values: Array, window: tuple[int, int]
+) -> tuple[Array, Array]:
+    """(m, n) sums of the values of members of the same face in a window around each beam, and their number.
+
+    In each scan those count that lie in one run of the face.
+    """
+    (m, n), (up, side) = labels.shape, (window[0] // 2, window[1] // 2)
+    row, start, stop, _ = runs_of(labels)
+    run = np.repeat(np.arange(len(row)), stop - start)
+    column = np.arange(len(run)) - np.repeat(np.cumsum(stop - start) - stop, stop - start)
+    first = row[run] * n
+    low, high = first + np.maximum(column - side, start[run]), first + np.minimum(column + side + 1, stop[run])
+    sums = np.zeros((2, m * n + 1))
+    np.cumsum(np.where(member, values, 0.0), out=sums[0, 1:])
+    np.cumsum(member, out=sums[1, 1:])
+    own = np.zeros((2, m, n))
+    own.reshape(2, -1)[:, first + column] = sums[:, high] - sums[:, low]
+    out = own.copy()
+    for step in range(1, up + 1):
+        same = labels[step:] == labels[:-step]
+        out[:, step:] += np.where(same, own[:, :-step], 0.0)
+        out[:, :-step] += np.where(same, own[:, step:], 0.0)
+    return out[0], out[1]
 
 
 def adopt(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], sigma: float) -> IntArray:

@@ -2,12 +2,12 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
 from bsmap_cli.core.bspline import clamped_knots, design_matrix, inner_knots
+from bsmap_cli.core.gaussian import noncentrality
 from bsmap_cli.core.knots import find_spans
 from bsmap_cli.fit.blocks import Blocks
 from bsmap_cli.fit.feet import Met, meet, tabulate
@@ -20,21 +20,21 @@ from bsmap_cli.fit.heights import (
     with_degree,
     with_knot,
 )
+from bsmap_cli.fit.smoothness import smoothness
 from bsmap_cli.model import Array, IntArray
 
 PRICE = 5.0
 """Of a control point, in chi square: between Akaike's 2, which keeps the covariance honest, and the logarithm of the
 number of data (BIC), which leaves gentle arcs flat."""
 HIGHEST_DEGREE = 3
-SMOOTH = 0.3
-"""Metres: second differences of the heights are of this size or less, and no larger than the spans are long. Only where
-there are no data does it matter."""
 ROBUST = 3.0
 """Standard deviations beyond which a block counts less (Huber)."""
 LEAST_BLOCKS = 4.0
 """Of each control point: what needs more than that is not smooth."""
 MOST_STEPS = 40
 """Of one search."""
+ANEW = 3
+"""Times that knots are sought, each time about the surface found before."""
 NEAR = 0.1
 """Standard deviations of a beam by which heights may change before the equations are made anew."""
 SETTLED = 1e-5
@@ -82,12 +82,18 @@ class _Data(NamedTuple):
 
 
 class _Solution(NamedTuple):
-    """Heights (k,) on knots with their information (k, k), chi square and criterion."""
+    """Heights (k,) on knots with their information (k, k) and that of the data alone, chi square and criterion."""
 
     knots: Knots
     heights: Array
     information: Array
+    of_data: Array
     chi_square: float
+
+    @property
+    def freedom(self) -> float:
+        """Number of heights that the data tell."""
+        return float(np.trace(np.linalg.solve(self.information, self.of_data)))
 
     @property
     def criterion(self) -> float:
@@ -97,14 +103,16 @@ class _Solution(NamedTuple):
         """The field with these knots and heights."""
         return replace(field, knots=self.knots, heights=self.heights.reshape(self.knots.shape))
 
-    def fitted(self, field: HeightField) -> Fitted:
-        """The field with these heights, and what is known of them."""
-        least = least_knots(field.base, field.low, field.high)
-        return Fitted(self.on(field), self.information * told(self.knots, least), self.criterion)
+    def fitted(self, field: HeightField, told: float = 1.0) -> Fitted:
+        """The field with these heights, and what is known of them, of which a share is told."""
+        return Fitted(self.on(field), told * self.information, self.criterion)
 
 
 def fit_heights(blocks: Blocks, base: Base, low: Array, high: Array, sigma: float) -> Fitted:
-    """Fit with the degrees and knots of the best criterion, found step by step from the least surface."""
+    """Fit with the degrees and knots of the best criterion, found step by step from the least surface.
+
+    Its information is that of noise alone: for what the knots leave out, it is to be fitted again on its own knots.
+    """
     knots = least_knots(base, low, high)
     field = HeightField(base, low, high, knots, np.zeros(knots.shape))
     data = _linearise(field, blocks, sigma)
@@ -117,7 +125,9 @@ def fit_heights(blocks: Blocks, base: Base, low: Array, high: Array, sigma: floa
     field = best.on(field)
     data = _linearise(field, blocks, sigma, data)
     best = _climb(_solve(best.knots, data), data, (_single_steps, _double_steps, _fewer_steps))
-    return best.fitted(field) if _is_near(best, field, sigma) else _settled(best.on(field), blocks, sigma, data)[0]
+    if not _is_near(best, field, sigma):
+        best = _settled(best.on(field), blocks, sigma, data).best
+    return best.fitted(field)
 
 
 def _is_near(best: _Solution, field: HeightField, sigma: float) -> bool:
@@ -127,41 +137,73 @@ def _is_near(best: _Solution, field: HeightField, sigma: float) -> bool:
 
 def refit(field: HeightField, blocks: Blocks, sigma: float, choose: bool = False) -> Fitted:
     """Fit on the degrees and knots that a field has; choose: on those that now pay, unless it is the least surface."""
-    if not choose or field.knots.size == least_knots(field.base, field.low, field.high).size:
-        return _settled(field, blocks, sigma, None)[0]
-    data = _linearise(field, blocks, sigma)
+    now = _settled(field, blocks, sigma, None)
+    for _ in range(ANEW if choose and field.knots.size > now.data.least.size else 0):
+        chosen = _chosen(now.best, field, blocks, sigma, now.data)
+        if chosen.best.knots is now.best.knots:
+            break
+        now = chosen
+    return now.best.fitted(field, _told(now.best, now.data))
+
+
+class _Settled(NamedTuple):
+    """A solution about its own surface, nearly, the equations for it, and metres of its last change."""
+
+    best: _Solution
+    data: _Data
+    change: float
+
+
+def _chosen(now: _Solution, field: HeightField, blocks: Blocks, sigma: float, data: _Data) -> _Settled:
+    """What is found on the knots that pay from those of a solution on."""
     # What no data bear any more goes first: it would stand in the way of other steps.
-    fewer = _climb(_solve(field.knots, data), data, (_fewer_steps,))
+    fewer = _climb(now, data, (_fewer_steps,))
     best = _climb(fewer, data, (_single_steps, _double_steps, _fewer_steps))
-    found, change = _settled(best.on(field), blocks, sigma, data)
+    found = _settled(best.on(field), blocks, sigma, data)
+    if found.change < sigma or best is fewer:
+        return found
     # More knots about a surface that is far from the data may follow equations that hold nowhere.
-    return found if change < sigma or best is fewer else _settled(fewer.on(field), blocks, sigma, data)[0]
+    found = _settled(found.best.on(field), blocks, sigma, None)
+    other = _settled(fewer.on(field), blocks, sigma, data)
+    return other if found.change >= sigma or other.best.criterion <= found.best.criterion else found
 
 
-def _settled(field: HeightField, blocks: Blocks, sigma: float, data: _Data | None) -> tuple[Fitted, float]:
-    """Fit on a field's knots, repeated about its own result, and metres of its last change; data: about one near it."""
+def _settled(field: HeightField, blocks: Blocks, sigma: float, data: _Data | None) -> _Settled:
+    """Fit on a field's knots, repeated about its own result; data: equations about one near it."""
     for _ in range(2):
-        data = _linearise(field, blocks, sigma, data)
-        best = _solve(field.knots, data)
+        about = data = _linearise(field, blocks, sigma, data)
+        best = _solve(field.knots, about)
         change = float(np.abs(best.heights - field.heights.ravel()).max())
         field = best.on(field)
         if change < SETTLED:
             break
-    return best.fitted(field), change
+    return _Settled(best, about, change)
 
 
-def told(knots: Knots, least: Knots) -> float:
+def _told(best: _Solution, data: _Data) -> float:
     """Share of the information on the heights that is told: 1 for the least surface, which the base stands for.
 
-    What was chosen to follow the data errs by what was left out, too, and the data cannot tell that from noise, or it
-    would be there. One control point more each way would have paid if it were worth PRICE; amplitudes up to the root of
-    that, all alike likely, have a third of it in the mean square.
+    What was chosen to follow the data errs by what was left out, too. How much that is, the data tell: by how much
+    more than noise alone would chi square fall with all spans halved and a degree more along s, and along t. (Halving
+    alone is blind to what is even, or odd, about the middle of a span.)
     """
-    if knots.size <= least.size:
+    if best.knots.size <= data.least.size:
         return 1.0
-    ns, nt = knots.shape
-    left_out = (ns + 1) * (nt + 1) - knots.size
-    return knots.size / (knots.size + left_out * PRICE / 3.0)
+    gain = more = 0.0
+    for axis in (0, 1):
+        finer = _solve(_finer(best.knots, axis), data)
+        # Shorter spans are held smooth more tightly: where no data bear them, that may cost more than they gain.
+        gain += max(0.0, best.chi_square - finer.chi_square)
+        more += finer.freedom - best.freedom
+    return best.knots.size / (best.knots.size + noncentrality(gain, more))
+
+
+def _finer(knots: Knots, axis: int) -> Knots:
+    """Knots with another one in the middle of each span along s or t, and a degree more there, up to the highest."""
+    degree, along = _along(knots, axis)
+    breaks, inner = np.unique(along), inner_knots(along, degree)
+    degree = min(degree + 1, HIGHEST_DEGREE)
+    return _with(knots, axis, _Line(degree, clamped_knots(degree, [*inner, *(breaks[1:] + breaks[:-1]) / 2.0])))
 
 
 def _linearise(field: HeightField, blocks: Blocks, sigma: float, near: _Data | None = None) -> _Data:
@@ -236,32 +278,7 @@ def _solve(knots: Knots, data: _Data) -> _Solution:
     scaled.flat[:: len(A) + 1] += 1e-12
     heights = scale * np.linalg.solve(scaled, scale * b)
     chi_square = data.square - float(heights @ (2.0 * b - A @ heights))
-    return _Solution(knots, heights, information, max(0.0, chi_square))
-
-
-def smoothness(knots: Knots, size: Array | None = None) -> Array:
-    """Information of second differences of neighbouring heights (first mixed ones of a bilinear patch are free).
-
-    size : (2,) metres of the rectangle; where not given, spans are taken to be longer than SMOOTH.
-    """
-    spans = np.array(knots.shape) - (knots.degree_s, knots.degree_t)
-    loose = np.full(2, SMOOTH) if size is None else np.minimum(SMOOTH, size / spans)
-    along_s, along_t, every = _smoothness(*knots.shape)
-    return along_s / loose[0] ** 2 + along_t / loose[1] ** 2 + every
-
-
-@lru_cache(maxsize=256)
-def _smoothness(ns: int, nt: int) -> tuple[Array, Array, Array]:
-    """Squares of second differences along s and along t, and what keeps heights that no others bear."""
-    rows = np.kron(_second(ns), np.eye(nt)), np.kron(np.eye(ns), _second(nt))
-    out = rows[0].T @ rows[0], rows[1].T @ rows[1], 1e-6 / SMOOTH**2 * np.eye(ns * nt)
-    for matrix in out:
-        matrix.flags.writeable = False
-    return out
-
-
-def _second(n: int) -> Array:
-    return np.diff(np.eye(n), 2, axis=0) if n > 2 else np.zeros((1, n))
+    return _Solution(knots, heights, information, A, max(0.0, chi_square))
 
 
 _Steps = Callable[[Knots, _Data, Array], Iterator[Knots]]

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from face_scenes import corridor_set, egg, passing_set, simulated_place
 
+from bsmap_cli.fit import misses as misses_module
 from bsmap_cli.fit.beams import make_grid
 from bsmap_cli.fit.beliefs import believed, scale_left, without_misfits
 from bsmap_cli.fit.division import _fit, blocks_of_faces, find_faces
-from bsmap_cli.fit.labels import ALIKE, _window_sums, find_misses, without_alike
+from bsmap_cli.fit.misses import ALIKE, _window_sums, find_misses, without_alike
 
 
 @pytest.fixture(scope="module")
@@ -73,8 +74,7 @@ def test_sums_of_neighbourhoods_are_those_of_beams_of_one_face():
     labels = np.repeat(rng.integers(-1, 3, (9, 12)), 3, axis=1)
     member = (labels >= 0) & (rng.random(labels.shape) < 0.8)
     values = rng.normal(size=labels.shape)
-    for (up, side), _ in ALIKE:
-        total, count = _window_sums(labels, member, values, (up, side))
+    for ((up, side), _), (total, count) in zip(ALIKE, _window_sums(labels, member, values), strict=True):
         for row, column in np.argwhere(labels >= 0):
             wanted, number = 0.0, 0
             for r in range(max(0, row - up // 2), min(9, row + up // 2 + 1)):
@@ -87,6 +87,14 @@ def test_sums_of_neighbourhoods_are_those_of_beams_of_one_face():
                         wanted, number = wanted + values[r, c] * member[r, c], number + member[r, c]
             assert count[row, column] == number
             assert total[row, column] == pytest.approx(wanted)
+
+
+def test_neighbourhoods_are_the_same_however_many_scans_are_worked_on_at_once(corridor, monkeypatch):
+    grid, faces, misses = corridor
+    whole = without_alike(grid, misses, 0.5 * faces.sigma)
+    assert np.count_nonzero(whole != misses.labels) > 10
+    monkeypatch.setattr(misses_module, "CHUNK", 3 * grid.hit.shape[1])
+    np.testing.assert_array_equal(without_alike(grid, misses, 0.5 * faces.sigma), whole)
 
 
 def test_beams_of_a_low_step_in_few_scans_leave_their_face(corridor):

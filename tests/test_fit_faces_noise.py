@@ -10,7 +10,8 @@ from bsmap_cli.evaluate import distance_to_mesh
 from bsmap_cli.fit.beams import make_grid
 from bsmap_cli.fit.division import find_faces
 from bsmap_cli.fit.heights import CylinderBase, PlaneBase, basis_matrix, evaluate, least_knots
-from bsmap_cli.fit.labels import feet_of_faces, find_misses, without_alike, without_slipped_ends
+from bsmap_cli.fit.labels import feet_of_faces
+from bsmap_cli.fit.misses import find_misses, without_alike, without_slipped_ends
 
 SIGMA = 0.03
 SEEDS = (0, 3, 5)

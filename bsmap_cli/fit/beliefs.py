@@ -8,7 +8,7 @@ from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.blocks import Blocks
 from bsmap_cli.fit.clutter import NOISY
 from bsmap_cli.fit.context import FLATNESS
-from bsmap_cli.fit.labels import Misses, without_outliers
+from bsmap_cli.fit.misses import Misses, without_outliers
 from bsmap_cli.fit.selection import PRICE, Fitted
 from bsmap_cli.model import IntArray
 

@@ -20,13 +20,11 @@ from bsmap_cli.fit.labels import (
     adopt,
     enclosed,
     fill,
-    find_misses,
     move_breaks,
     runs_of,
-    without_alike,
-    without_slipped_ends,
 )
 from bsmap_cli.fit.lowmodels import CylinderFrame, fit_cylinder_frame, fit_plane_frame, turned
+from bsmap_cli.fit.misses import find_misses, without_alike, without_slipped_ends
 from bsmap_cli.fit.pieces import find_pieces
 from bsmap_cli.fit.regions import find_regions
 from bsmap_cli.fit.seeds import PAIR_BEAMS
@@ -99,8 +97,10 @@ def find_faces(grid: BeamGrid) -> Faces:
     misses = find_misses(grid, labels, [f.field for f in fitted], before=misses)
     labels, kept = _kept(fill(grid, believed(grid, misses, sigma, noise)), grid)
     fitted = _widened(grid, labels, [fitted[k] for k in kept], noise)
-    misses = find_misses(grid, labels, [f.field for f in fitted], before=misses)
-    labels = fill(grid, believed(grid, misses, sigma, noise))
+    # Planes lie as before; what is bent was fitted anew to single beams, on other knots.
+    bent = np.append([f.field.knots.size > 4 for f in fitted], False).astype(bool)
+    misses = find_misses(grid, np.where(bent[labels], labels, -1), [f.field for f in fitted], before=misses)
+    labels = fill(grid, np.where(bent[labels], believed(grid, misses, sigma, noise), labels))
     for number, one in enumerate(fitted):
         points = grid.points[(labels == number) & grid.hit]
         if len(points) < LEAST_BLOCKS * one.field.knots.size or _stands_on_edge(one.field, points):

@@ -180,7 +180,7 @@ def offsets(table: Table, face: IntArray, points: Array) -> tuple[Array, Array]:
     at, arm = _round_ones(table, face, len(points))
     if len(at):
         local[:, at], c, s = _around(table, face[at], local[:, at])
-    height, gradient, _ = _heights(table, face, local)
+    height, gradient, _ = _heights(table, face, _of_faces(table, face), local)
     normal = frame[6:9] - gradient[0] * frame[0:3] - gradient[1] * frame[3:6]
     if len(at):
         around = gradient[0, at] * arm / np.maximum(arm + local[2, at], 0.1 * arm)
@@ -204,7 +204,7 @@ def _newton(table: Table, face: IntArray, p: Array, d: Array, start: Array, step
     flat, turn = _in_frames(table, face, p, d)
     at, arm = _round_ones(table, face, p.shape[1])
     round_ones, ahead = np.broadcast_to(face, p.shape[1])[at] if len(at) else at, turn[:, at]
-    beyond = start.copy()
+    beyond, own = start.copy(), _of_faces(table, face)
     for step in range(steps):
         local = flat + beyond * turn
         if len(at):
@@ -212,16 +212,16 @@ def _newton(table: Table, face: IntArray, p: Array, d: Array, start: Array, step
             stretch = arm / np.maximum(arm + local[2, at], 0.1 * arm)
             dx, dy, dz = ahead
             turn[:, at] = (dy * c - dx * s) * stretch, dz, dx * c + dy * s
-        height, gradient, uv = _heights(table, face, local)
+        height, gradient, uv = _heights(table, face, own, local)
         climb = gradient[0] * turn[0] + gradient[1] * turn[1]
         slope = _steep(turn[2] - climb)
-        move = np.clip((local[2] - height) / slope, -FARTHEST, FARTHEST)
+        move = np.minimum(np.maximum((local[2] - height) / slope, -FARTHEST), FARTHEST)
         beyond -= move
         left = np.flatnonzero(np.abs(move) >= SETTLED) if step < steps - 1 else at[:0]
         if 2 * len(left) <= len(move):
             break
-    uv -= move * turn[:2] / table.size.take(face, axis=1)
-    rest = np.stack([beyond, slope, height - move * climb])
+    uv -= move * turn[:2] / own.size
+    rest = np.array([beyond, slope, height - move * climb])
     if len(left):  # few beams, most often grazing ones, need more steps than the others
         few = face if len(face) == 1 else face[left]
         uv[:, left], rest[:, left] = _newton(table, few, p[:, left], d[:, left], beyond[left], steps - 1 - step)
@@ -245,12 +245,12 @@ def _on_bilinear(table: Table, face: IntArray, p: Array, d: Array, start: Array,
         raw = rise + 2.0 * bent
         off = above + beyond * (rise + bent)
         slope = _steep(raw)
-        move = np.clip(off / slope, -FARTHEST, FARTHEST)
+        move = np.minimum(np.maximum(off / slope, -FARTHEST), FARTHEST)
         before, beyond = beyond, beyond - move
         if step == steps - 1 or np.abs(move).max(initial=0.0) < SETTLED:
             break
-    uv = 0.5 * (np.stack([x + beyond * dx, y + beyond * dy]) + 1.0)
-    return uv, np.stack([beyond, slope, flat[2] + before * turn[2] - off - move * (turn[2] - raw)])
+    uv = 0.5 * (np.array([x + beyond * dx, y + beyond * dy]) + 1.0)
+    return uv, np.array([beyond, slope, flat[2] + before * turn[2] - off - move * (turn[2] - raw)])
 
 
 def _steep(slope: Array) -> Array:
@@ -270,7 +270,7 @@ def _in_frames(table: Table, face: IntArray, p: Array, d: Array) -> tuple[Array,
 def _turned(frame: Array, vectors: Array) -> Array:
     """(3, n) vectors (3, n), each in its frame (12, n)."""
     x, y, z = vectors
-    return np.stack([frame[k] * x + frame[k + 1] * y + frame[k + 2] * z for k in (0, 3, 6)])
+    return np.array([frame[k] * x + frame[k + 1] * y + frame[k + 2] * z for k in (0, 3, 6)])
 
 
 def _in_map(frame: Array, vectors: Array) -> Array:
@@ -297,25 +297,61 @@ def _around(table: Table, face: IntArray, place: Array) -> tuple[Array, Array, A
     angle = (np.arctan2(y, x) - table.middle[face] + np.pi) % (2.0 * np.pi) - np.pi
     distance = np.hypot(x, y)
     safe = np.maximum(distance, 1e-12)
-    return np.stack([angle * radius, z, distance - radius]), x / safe, y / safe
+    return np.array([angle * radius, z, distance - radius]), x / safe, y / safe
 
 
-def _heights(table: Table, face: IntArray, local: Array) -> tuple[Array, Array, Array]:
-    """Heights (n,) at s, t of `local` (3, n), gradients (2, n) by s and t, and parameters (2, n)."""
-    size = table.size.take(face, axis=1)
-    uv = (local[:2] - table.low.take(face, axis=1)) / size
-    inside = np.clip(uv, table.least.take(face), table.most.take(face))
-    number, x, scale = zip(
-        *(_own_parameter(line, face, u) for line, u in zip(table.lines, inside, strict=True)), strict=True
-    )
-    piece = table.first_piece.take(face) + number[0] * table.lines[1].spans.take(face) + number[1]
+class _Own(NamedTuple):
+    """What of a table belongs to the faces of n beams, or to one for all: looked up once, not in each step.
+
+    low, size, bulge : (2, n or 1).  least, most, piece, spans : (n or 1,).  orders : of the coefficients along t, s.
+    first : (n or 1,) number of the first span along s and along t.
+    """
+
+    low: Array
+    size: Array
+    bulge: Array | None
+    least: Array
+    most: Array
+    piece: IntArray
+    spans: IntArray
+    orders: tuple[int, int]
+    first: tuple[IntArray, IntArray]
+
+
+def _of_faces(table: Table, face: IntArray) -> _Own:
+    """The same for faces (n,), or one (1,)."""
     orders_t, orders_s = table.orders.take(face, axis=1).max(axis=1, initial=2).tolist()
-    value, by_x, by_y = horner(table.coefficients[:orders_t, :orders_s].take(piece, axis=2), *x)
-    gradient = np.stack([by_x * scale[0], by_y * scale[1]])
+    along_s, along_t = table.lines
+    return _Own(
+        table.low.take(face, axis=1),
+        table.size.take(face, axis=1),
+        table.bulge.take(face, axis=1) if table.bulge.any() else None,
+        table.least.take(face),
+        table.most.take(face),
+        table.first_piece.take(face),
+        along_t.spans.take(face),
+        (orders_t, orders_s),
+        (along_s.first.take(face), along_t.first.take(face)),
+    )
+
+
+def _heights(table: Table, face: IntArray, own: _Own, local: Array) -> tuple[Array, Array, Array]:
+    """Heights (n,) at s, t of `local` (3, n), gradients (2, n) by s and t, and parameters (2, n)."""
+    uv = (local[:2] - own.low) / own.size
+    inside = np.minimum(np.maximum(uv, own.least), own.most)
+    along_s, along_t = (
+        _own_parameter(line, face, first, u) for line, first, u in zip(table.lines, own.first, inside, strict=True)
+    )
+    piece = own.piece + along_s[0] * own.spans + along_t[0]
+    orders_t, orders_s = own.orders
+    value, by_x, by_y = horner(table.coefficients[:orders_t, :orders_s].take(piece, axis=2), along_s[1], along_t[1])
+    gradient = np.empty(uv.shape)
+    np.multiply(by_x, along_s[2], out=gradient[0])
+    np.multiply(by_y, along_t[2], out=gradient[1])
     height = value + gradient[0] * (uv[0] - inside[0]) + gradient[1] * (uv[1] - inside[1])
-    gradient /= size
-    if table.bulge.any():
-        middle, radius = np.broadcast_to(table.bulge.take(face, axis=1), uv.shape)
+    gradient /= own.size
+    if own.bulge is not None:
+        middle, radius = np.broadcast_to(own.bulge, uv.shape)
         at = np.flatnonzero(radius)
         more, slope = bulge_over(radius[at], local[1, at] - middle[at])
         height[at] += more
@@ -323,11 +359,12 @@ def _heights(table: Table, face: IntArray, local: Array) -> tuple[Array, Array, 
     return height, gradient, uv
 
 
-def _own_parameter(line: Lines, face: IntArray, u: Array) -> tuple[IntArray, Array, Array]:
+def _own_parameter(line: Lines, face: IntArray, first: IntArray, u: Array) -> tuple[IntArray, Array, Array]:
     """Number (n,) of the span of each parameter (n,) in its face, the span's own parameter, and its change."""
-    number, first = np.zeros(len(u), dtype=np.int64), line.first.take(face)
+    number = np.zeros(len(u), dtype=np.int64)
     if len(line.begins) > len(line.first) and (len(face) != 1 or line.spans[face[0]] > 1):
-        number = line.begins.searchsorted(np.clip(u, 0.0, 1.0) + 2.0 * face, side="right") - 1 - first
+        within = np.minimum(np.maximum(u, 0.0), 1.0)
+        number = line.begins.searchsorted(within + 2.0 * face, side="right") - 1 - first
     span = number + first
     scale = line.scales.take(span)
     return number, (u - line.middles.take(span)) * scale, scale

@@ -8,17 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bsmap_cli.fit.beams import BeamGrid
-from bsmap_cli.fit.context import FLATNESS
 from bsmap_cli.fit.feet import STEEPEST, Feet, Met, Table, find_feet, meet, tabulate
 from bsmap_cli.fit.heights import HeightField
 from bsmap_cli.model import Array, IntArray
 
 OUTLIER, ADOPTED = 4.5, 3.5
 """Standard deviations beyond which a beam leaves its face, within which one of the rest joins a neighbouring face."""
-SLIPPED = 2.0
-"""The same, of noise and flatness together, for the last beam before a jump that misses its face towards the next."""
-ALIKE = (((3, 3), 0.0), ((7, 1), 0.0), ((3, 13), FLATNESS))
-"""Scans and beams of neighbourhoods whose misses are added up, and metres that these may have in common."""
 NEXT = ((-1, 0), (1, 0), (0, -2), (0, -1), (0, 1), (0, 2))
 """Scans and beams from a beam to those that its face may adopt."""
 PASSES = 30
@@ -64,12 +59,12 @@ def met_at(
 
 def places_of_faces(grid: BeamGrid, labels: IntArray, faces: int) -> list[IntArray]:
     """Flat indices of the beams of each of so many faces that have a return, in the order of the grid."""
-    at = _by_face(np.flatnonzero((labels >= 0) & grid.hit), labels, faces)
+    at = by_face(np.flatnonzero((labels >= 0) & grid.hit), labels, faces)
     ends = np.cumsum(np.bincount(labels.ravel()[at], minlength=faces)).tolist()
     return [at[a:b] for a, b in itertools.pairwise([0, *ends])]
 
 
-def _by_face(at: IntArray, labels: IntArray, faces: int) -> IntArray:
+def by_face(at: IntArray, labels: IntArray, faces: int) -> IntArray:
     """Flat indices `at` (k,) of beams, face after face."""
     # Short numbers are sorted in one pass.
     kind = np.int16 if faces < 2**15 else np.int64
@@ -86,116 +81,6 @@ def feet_of_faces(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField
     )
     ends = np.cumsum([0, *(len(of) for of in places)]).tolist()
     return [Feet(*(of[a:b] for of in feet)) for a, b in itertools.pairwise(ends)]
-
-
-class Misses(NamedTuple):
-    """Labels (m, n), and metres (m, n) from the point on to the beam's face, along the beam.
-
-    0 for beams without face; infinite for those that only graze it, and may pass it.
-    """
-
-    labels: IntArray
-    beyond: Array
-
-
-def find_misses(
-    grid: BeamGrid,
-    labels: IntArray,
-    fields: Sequence[HeightField],
-    known: Misses | None = None,
-    before: Misses | None = None,
-) -> Misses:
-    """How all beams miss their faces.
-
-    known : the same for other labels, which is kept where these agree.  before : the same for fields near these ones.
-    """
-    beyond = np.zeros(labels.size) if known is None else np.where(labels >= 0, known.beyond, 0.0).ravel()
-    new = (labels >= 0) & grid.hit
-    if known is not None:
-        new &= labels != known.labels
-    at = _by_face(np.flatnonzero(new), labels, len(fields))
-    start = None
-    if before is not None:
-        start = np.where(before.labels.ravel()[at] >= 0, before.beyond.ravel()[at], 0.0)
-        start[~np.isfinite(start)] = 0.0
-    points, directions = grid.points.reshape(-1, 3), grid.directions.reshape(-1, 3)
-    met = meet(tabulate(fields), labels.ravel()[at], points, directions, at, start)
-    beyond[at] = np.where(np.abs(met.slope) > STEEPEST, met.beyond, np.inf)
-    return Misses(labels, beyond.reshape(labels.shape))
-
-
-def without_outliers(misses: Misses, sigma: float) -> IntArray:
-    """Labels without the beams that miss their face by more than noise, or that graze it."""
-    return np.where(np.abs(misses.beyond) < OUTLIER * sigma, misses.labels, -1)
-
-
-def without_alike(grid: BeamGrid, misses: Misses, sigma: float) -> IntArray:
-    """Labels without the beams that miss their face by less than an outlier, but together with their neighbours.
-
-    The side of a recess that is no deeper than the gate of outliers would otherwise be shared out to the faces above
-    and below it. What many have in common may be the unevenness of a real wall.
-    """
-    labels = misses.labels
-    member = (labels >= 0) & grid.hit
-    miss = np.clip(misses.beyond / sigma, -OUTLIER, OUTLIER)
-    alike = np.zeros(labels.shape, dtype=bool)
-    for window, uneven in ALIKE:
-        total, count = _window_sums(labels, member, miss, window)
-        most = OUTLIER * np.sqrt(count) + uneven / sigma * count
-        alike |= member & (np.abs(total) > most) & (miss * total > 0.0)
-    return np.where(alike, -1, labels)
-
-
-def without_slipped_ends(grid: BeamGrid, misses: Misses, fields: Sequence[HeightField], sigma: float) -> IntArray:
-    """Labels without those last beams of runs that are on their way to where the scan goes on beyond a jump.
-
-    A beam at the edge of a jump may have hit what lies between (the side of a recess, a wall of which only one scan
-    tells): then it misses its face on the side on which the next beam does, and neither face behind it fits.
-    """
-    labels, table = misses.labels.copy(), tabulate(fields)
-    for step in (-1, 1):
-        row, column = np.nonzero(
-            (labels >= 0) & (np.abs(misses.beyond) > SLIPPED * np.hypot(sigma, FLATNESS)) & grid.hit
-        )
-        following = column + step
-        inside = (following >= 0) & (following < labels.shape[1])
-        row, column, following = row[inside], column[inside], following[inside]
-        face, other = misses.labels[row, column], misses.labels[row, following]
-        ends = (other != face) & grid.hit[row, following]
-        row, column, following, face, other = (of[ends] for of in (row, column, following, face, other))
-        own, next_one = misses.beyond[row, column], met_at(grid, table, face, row, following).beyond
-        gone = (own * next_one > 0.0) & (np.abs(next_one) > np.abs(own))
-        meets = np.flatnonzero(gone & (other >= 0))
-        to_other = met_at(grid, table, other[meets], row[meets], column[meets]).beyond
-        gone[meets] = np.abs(to_other) > OUTLIER * sigma
-        labels[row[gone], column[gone]] = -1
-    return labels
-
-
-def _window_sums(
-    labels: IntArray, member: NDArray[np.bool_], values: Array, window: tuple[int, int]
-) -> tuple[Array, Array]:
-    """(m, n) sums of the values of members of the same face in a window around each beam, and their number.
-
-    In each scan those count that lie in one run of the face.
-    """
-    (m, n), (up, side) = labels.shape, (window[0] // 2, window[1] // 2)
-    row, start, stop, _ = runs_of(labels)
-    run = np.repeat(np.arange(len(row)), stop - start)
-    column = np.arange(len(run)) - np.repeat(np.cumsum(stop - start) - stop, stop - start)
-    first = row[run] * n
-    low, high = first + np.maximum(column - side, start[run]), first + np.minimum(column + side + 1, stop[run])
-    sums = np.zeros((2, m * n + 1))
-    np.cumsum(np.where(member, values, 0.0), out=sums[0, 1:])
-    np.cumsum(member, out=sums[1, 1:])
-    own = np.zeros((2, m, n))
-    own.reshape(2, -1)[:, first + column] = sums[:, high] - sums[:, low]
-    out = own.copy()
-    for step in range(1, up + 1):
-        same = labels[step:] == labels[:-step]
-        out[:, step:] += np.where(same, own[:, :-step], 0.0)
-        out[:, :-step] += np.where(same, own[:, step:], 0.0)
-    return out[0], out[1]
 
 
 def adopt(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], sigma: float) -> IntArray:

@@ -138,12 +138,17 @@ def _is_near(best: _Solution, field: HeightField, sigma: float) -> bool:
 def refit(field: HeightField, blocks: Blocks, sigma: float, choose: bool = False) -> Fitted:
     """Fit on the degrees and knots that a field has; choose: on those that now pay, unless it is the least surface."""
     now = _settled(field, blocks, sigma, None)
+    beyond = _beyond(now.best, now.data)
     for _ in range(ANEW if choose and field.knots.size > now.data.least.size else 0):
-        chosen = _chosen(now.best, field, blocks, sigma, now.data)
+        # What no data bear any more goes first: it would stand in the way of other steps.
+        fewer = _climb(now.best, now.data, (_fewer_steps,))
+        if fewer is now.best and not beyond.pays:
+            break
+        chosen = _chosen(fewer, field, blocks, sigma, now.data)
         if chosen.best.knots is now.best.knots:
             break
-        now = chosen
-    return now.best.fitted(field, _told(now.best, now.data))
+        now, beyond = chosen, _beyond(chosen.best, chosen.data)
+    return now.best.fitted(field, _told(now.best, beyond))
 
 
 class _Settled(NamedTuple):
@@ -154,10 +159,8 @@ class _Settled(NamedTuple):
     change: float
 
 
-def _chosen(now: _Solution, field: HeightField, blocks: Blocks, sigma: float, data: _Data) -> _Settled:
+def _chosen(fewer: _Solution, field: HeightField, blocks: Blocks, sigma: float, data: _Data) -> _Settled:
     """What is found on the knots that pay from those of a solution on."""
-    # What no data bear any more goes first: it would stand in the way of other steps.
-    fewer = _climb(now, data, (_fewer_steps,))
     best = _climb(fewer, data, (_single_steps, _double_steps, _fewer_steps))
     found = _settled(best.on(field), blocks, sigma, data)
     if found.change < sigma or best is fewer:
@@ -180,22 +183,42 @@ def _settled(field: HeightField, blocks: Blocks, sigma: float, data: _Data | Non
     return _Settled(best, about, change)
 
 
-def _told(best: _Solution, data: _Data) -> float:
+class _Beyond(NamedTuple):
+    """What finer knots along s, and along t, would gain in chi square, and how many heights more they have, in all.
+
+    pays : whether a knot or a degree more may pay.
+    """
+
+    gain: float
+    more: float
+    pays: bool
+
+
+def _beyond(best: _Solution, data: _Data) -> _Beyond:
+    """All spans halved and a degree more along s, and along t; nothing of the least surface, which is not refined.
+
+    Halving alone is blind to what is even, or odd, about the middle of a span.
+    """
+    gains, more = [0.0, 0.0], 0.0
+    if best.knots.size > data.least.size:
+        for axis in (0, 1):
+            finer = _solve(_finer(best.knots, axis), data)
+            # Shorter spans are held smooth more tightly: where no data bear them, that may cost more than they gain.
+            gains[axis] = max(0.0, best.chi_square - finer.chi_square)
+            more += finer.freedom - best.freedom
+    pays = any(gain > PRICE * across for gain, across in zip(gains, best.knots.shape[::-1], strict=True))
+    return _Beyond(sum(gains), more, pays)
+
+
+def _told(best: _Solution, beyond: _Beyond) -> float:
     """Share of the information on the heights that is told: 1 for the least surface, which the base stands for.
 
     What was chosen to follow the data errs by what was left out, too. How much that is, the data tell: by how much
-    more than noise alone would chi square fall with all spans halved and a degree more along s, and along t. (Halving
-    alone is blind to what is even, or odd, about the middle of a span.)
+    more than noise alone chi square would fall on finer knots.
     """
-    if best.knots.size <= data.least.size:
+    if not beyond.more:
         return 1.0
-    gain = more = 0.0
-    for axis in (0, 1):
-        finer = _solve(_finer(best.knots, axis), data)
-        # Shorter spans are held smooth more tightly: where no data bear them, that may cost more than they gain.
-        gain += max(0.0, best.chi_square - finer.chi_square)
-        more += finer.freedom - best.freedom
-    return best.knots.size / (best.knots.size + noncentrality(gain, more))
+    return best.knots.size / (best.knots.size + noncentrality(beyond.gain, beyond.more))
 
 
 def _finer(knots: Knots, axis: int) -> Knots:

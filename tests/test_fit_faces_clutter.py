@@ -7,7 +7,8 @@ from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.blocks import Blocks
 from bsmap_cli.fit.clutter import FEWEST, NOISY, find_planes
 from bsmap_cli.fit.heights import Knots, PlaneBase
-from bsmap_cli.fit.selection import fit_heights, smoothness
+from bsmap_cli.fit.selection import fit_heights
+from bsmap_cli.fit.smoothness import smoothness
 
 SIGMA = 0.01
 SHAPE = 20, 60

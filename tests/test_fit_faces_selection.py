@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bsmap_cli.core.bspline import clamped_knots, inner_knots, open_knots
-from bsmap_cli.fit import selection
+from bsmap_cli.fit import equations, selection
 from bsmap_cli.fit.blocks import Blocks
 from bsmap_cli.fit.heights import CylinderBase, HeightField, Knots, PlaneBase, basis_matrix, evaluate, least_knots
 from bsmap_cli.fit.selection import PRICE, fit_heights, refit
@@ -90,7 +90,7 @@ def told_share(height, seed, knots):
     """Share of the equations' information that a fit on such knots tells."""
     blocks = blocks_of(height, seed)
     fitted = refit(field_on(knots), blocks, SIGMA)
-    data = selection._linearise(fitted.field, blocks, SIGMA)
+    data = equations.linearise(fitted.field, blocks, SIGMA)
     raw = selection._solve(knots, data).information
     np.testing.assert_allclose(fitted.information, raw * (share := fitted.information[0, 0] / raw[0, 0]), rtol=1e-3)
     return share
@@ -125,9 +125,9 @@ def test_knots_are_sought_anew_about_what_was_found():
     """On far too few knots the first surface lies far from the data."""
     blocks = blocks_of(lambda s, t: 0.3 * np.sin(3.0 * s))
     fitted = refit(field_on(Knots(2, 1, open_knots(2), open_knots(1))), blocks, SIGMA, choose=True)
-    data = selection._linearise(fitted.field, blocks, SIGMA)
+    data = equations.linearise(fitted.field, blocks, SIGMA)
     now = selection._solve(fitted.field.knots, data)
-    steps = list(selection._single_steps(now.knots, data, selection._misfit(now.knots, now.heights, data) ** 2))
+    steps = list(selection._single_steps(now.knots, data, equations.misfits(now.knots, now.heights, data) ** 2))
     assert min(selection._solve(step, data).criterion for step in steps) > now.criterion - 1e-6
 
 
@@ -157,10 +157,10 @@ def test_normal_equations_are_products_of_all_basis_functions(spans):
     """Each span for itself, where there are many; one of them has no data."""
     inner = np.arange(1, spans) / spans
     knots = Knots(3, 2, clamped_knots(3, inner), clamped_knots(2, np.array([0.5])))
-    data = selection._linearise(field_on(knots), blocks_of(lambda s, t: 0.1 * np.sin(s) * t, until=3.7), SIGMA)
-    A, b = selection._normal_equations(knots, data)
+    data = equations.linearise(field_on(knots), blocks_of(lambda s, t: 0.1 * np.sin(s) * t, until=3.7), SIGMA)
+    A, b = equations.normal_equations(knots, data)
     N = basis_matrix(knots, data.feet.uv) * data.root[:, None]
     np.testing.assert_allclose(A, N.T @ N, atol=1e-9 * A.max())
     np.testing.assert_allclose(b, N.T @ data.wanted, atol=1e-9 * np.abs(b).max())
     heights = np.random.default_rng(0).normal(size=knots.size)
-    np.testing.assert_allclose(selection._misfit(knots, heights, data), N @ heights - data.wanted, atol=1e-9)
+    np.testing.assert_allclose(equations.misfits(knots, heights, data), N @ heights - data.wanted, atol=1e-9)

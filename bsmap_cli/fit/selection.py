@@ -6,29 +6,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bsmap_cli.core.bspline import clamped_knots, design_matrix, inner_knots
+from bsmap_cli.core.bspline import clamped_knots, inner_knots
 from bsmap_cli.core.gaussian import noncentrality
-from bsmap_cli.core.knots import find_spans
 from bsmap_cli.fit.blocks import Blocks
-from bsmap_cli.fit.feet import Met, meet, tabulate
+from bsmap_cli.fit.equations import Equations, linearise, misfits, normal_equations, number_of_places
 from bsmap_cli.fit.heights import (
     Base,
     HeightField,
     Knots,
-    bulge_of,
     least_knots,
     with_degree,
     with_knot,
 )
 from bsmap_cli.fit.smoothness import smoothness
-from bsmap_cli.model import Array, IntArray
+from bsmap_cli.model import Array
 
 PRICE = 5.0
 """Of a control point, in chi square: between Akaike's 2, which keeps the covariance honest, and the logarithm of the
 number of data (BIC), which leaves gentle arcs flat."""
 HIGHEST_DEGREE = 3
-ROBUST = 3.0
-"""Standard deviations beyond which a block counts less (Huber)."""
 LEAST_BLOCKS = 4.0
 """Of each control point: what needs more than that is not smooth."""
 MOST_STEPS = 40
@@ -39,10 +35,6 @@ NEAR = 0.1
 """Standard deviations of a beam by which heights may change before the equations are made anew."""
 SETTLED = 1e-5
 """Metres of change of the heights below which a fit about its own result is not repeated."""
-MANY = 8
-"""Control points along s from which each span is worked on for itself."""
-CHUNK = 2048
-"""Rows of the equations that are worked on at a time."""
 MOST = 400
 """Control points of one face."""
 
@@ -53,32 +45,6 @@ class Fitted(NamedTuple):
     field: HeightField
     information: Array
     criterion: float
-
-
-class _Data(NamedTuple):
-    """Feet (n,) of the blocks; heights wanted there and roots of the weights, standard deviations.
-
-    square : of all heights wanted.  places : along s and t, number of distinct parameters, to a thousandth.
-    least : knots of the least surface.  size : (2,) metres of the rectangle along s and t.
-    bases : basis functions at the feet that were computed so far, by direction, degree and knots; along s times `root`.
-    """
-
-    feet: Met
-    wanted: Array
-    root: Array
-    square: float
-    places: tuple[int, int]
-    least: Knots
-    size: Array
-    bases: dict[tuple[int, int, bytes], Array]
-
-    def basis(self, axis: int, degree: int, knots: Array) -> Array:
-        """(n, k) basis functions along s (0), weighted, or t (1)."""
-        key = axis, degree, knots.tobytes()
-        if key not in self.bases:
-            values = design_matrix(knots, degree, np.clip(self.feet.uv[:, axis], 0.0, 1.0))
-            self.bases[key] = values if axis else values * self.root[:, None]
-        return self.bases[key]
 
 
 class _Solution(NamedTuple):
@@ -115,7 +81,7 @@ def fit_heights(blocks: Blocks, base: Base, low: Array, high: Array, sigma: floa
     """
     knots = least_knots(base, low, high)
     field = HeightField(base, low, high, knots, np.zeros(knots.shape))
-    data = _linearise(field, blocks, sigma)
+    data = linearise(field, blocks, sigma)
     best = _climb(_solve(knots, data), data, (_single_steps,))
     if _is_near(best, field, sigma):
         # Single steps have been tried about this very surface.
@@ -123,7 +89,7 @@ def fit_heights(blocks: Blocks, base: Base, low: Array, high: Array, sigma: floa
     if _is_near(best, field, sigma):
         return best.fitted(field)
     field = best.on(field)
-    data = _linearise(field, blocks, sigma, data)
+    data = linearise(field, blocks, sigma, data)
     best = _climb(_solve(best.knots, data), data, (_single_steps, _double_steps, _fewer_steps))
     if not _is_near(best, field, sigma):
         best = _settled(best.on(field), blocks, sigma, data).best
@@ -155,11 +121,11 @@ class _Settled(NamedTuple):
     """A solution about its own surface, nearly, the equations for it, and metres of its last change."""
 
     best: _Solution
-    data: _Data
+    data: Equations
     change: float
 
 
-def _chosen(fewer: _Solution, field: HeightField, blocks: Blocks, sigma: float, data: _Data) -> _Settled:
+def _chosen(fewer: _Solution, field: HeightField, blocks: Blocks, sigma: float, data: Equations) -> _Settled:
     """What is found on the knots that pay from those of a solution on."""
     best = _climb(fewer, data, (_single_steps, _double_steps, _fewer_steps))
     found = _settled(best.on(field), blocks, sigma, data)
@@ -171,10 +137,10 @@ def _chosen(fewer: _Solution, field: HeightField, blocks: Blocks, sigma: float, 
     return other if found.change >= sigma or other.best.criterion <= found.best.criterion else found
 
 
-def _settled(field: HeightField, blocks: Blocks, sigma: float, data: _Data | None) -> _Settled:
+def _settled(field: HeightField, blocks: Blocks, sigma: float, data: Equations | None) -> _Settled:
     """Fit on a field's knots, repeated about its own result; data: equations about one near it."""
     for _ in range(2):
-        about = data = _linearise(field, blocks, sigma, data)
+        about = data = linearise(field, blocks, sigma, data)
         best = _solve(field.knots, about)
         change = float(np.abs(best.heights - field.heights.ravel()).max())
         field = best.on(field)
@@ -194,7 +160,7 @@ class _Beyond(NamedTuple):
     pays: bool
 
 
-def _beyond(best: _Solution, data: _Data) -> _Beyond:
+def _beyond(best: _Solution, data: Equations) -> _Beyond:
     """All spans halved and a degree more along s, and along t; nothing of the least surface, which is not refined.
 
     Halving alone is blind to what is even, or odd, about the middle of a span.
@@ -229,72 +195,9 @@ def _finer(knots: Knots, axis: int) -> Knots:
     return _with(knots, axis, _Line(degree, clamped_knots(degree, [*inner, *(breaks[1:] + breaks[:-1]) / 2.0])))
 
 
-def _linearise(field: HeightField, blocks: Blocks, sigma: float, near: _Data | None = None) -> _Data:
-    """Linear equations about a field's own feet; near: those of one near it."""
-    only = np.zeros(len(blocks.counts), dtype=np.int64)
-    start = None if near is None else near.feet.beyond
-    feet = meet(tabulate([field]), only, blocks.points, blocks.directions, start=start)
-    wanted = feet.height - feet.slope * feet.beyond
-    bulge = bulge_of(field.base)
-    if bulge is not None:
-        wanted -= bulge.over(field.low[1] + feet.uv[:, 1] * (field.high[1] - field.low[1]))[0]
-    root = np.sqrt(blocks.counts) / sigma
-    size = np.abs(feet.beyond) * root
-    # What does not fit yet is no outlier: the scale is that of the residuals.
-    scale = max(1.0, float(np.median(size)) / 0.6745)
-    robust = np.sqrt(np.minimum(1.0, ROBUST * scale / np.maximum(size, 1e-12)))
-    root = root * robust / np.abs(feet.slope)
-    places = _places(feet.uv[:, 0]), _places(feet.uv[:, 1])
-    least = least_knots(field.base, field.low, field.high)
-    wanted = wanted * root
-    return _Data(feet, wanted, root, float(wanted @ wanted), places, least, field.high - field.low, {})
-
-
-def _places(u: Array) -> int:
-    """Number of distinct parameters (n,), clamped to [0, 1], to a thousandth."""
-    return int(np.count_nonzero(np.bincount(np.rint(np.clip(u, 0.0, 1.0) * 1000.0).astype(np.int64))))
-
-
-def _normal_equations(knots: Knots, data: _Data) -> tuple[Array, Array]:
-    """(k, k) and (k,): products of the basis functions' products with each other, and with the heights wanted."""
-    along_s, along_t = data.basis(0, knots.degree_s, knots.s), data.basis(1, knots.degree_t, knots.t)
-    nt = knots.shape[1]
-    if len(data.root) <= CHUNK and knots.shape[0] < MANY:
-        N = (along_s[:, :, None] * along_t[:, None, :]).reshape(-1, knots.size)
-        return N.T @ N, data.wanted @ N
-    A, b = np.zeros((knots.size, knots.size)), np.zeros(knots.size)
-    for rows, own in _parts(knots, data):
-        N = (along_s[rows, own, None] * along_t[rows, None, :]).reshape(-1, (own.stop - own.start) * nt)
-        there = slice(own.start * nt, own.stop * nt)
-        A[there, there] += N.T @ N
-        b[there] += data.wanted[rows] @ N
-    return A, b
-
-
-def _parts(knots: Knots, data: _Data) -> Iterator[tuple[slice | IntArray, slice]]:
-    """Rows of the equations worked on at a time, which fit into the cache, and the functions along s that they need.
-
-    Where there are many spans along s, the rows of each are taken for themselves: the others' functions are 0 there.
-    """
-    ns, degree = knots.shape[0], knots.degree_s
-    if ns < MANY:
-        yield from ((slice(first, first + CHUNK), slice(0, ns)) for first in range(0, len(data.root), CHUNK))
-        return
-    span = find_spans(knots.s, degree, np.clip(data.feet.uv[:, 0], 0.0, 1.0)) - degree
-    order = np.argsort(span, kind="stable")
-    for first, rows in enumerate(np.split(order, np.cumsum(np.bincount(span, minlength=ns - degree))[:-1])):
-        yield rows, slice(first, first + degree + 1)
-
-
-def _misfit(knots: Knots, heights: Array, data: _Data) -> Array:
-    """(n,) by how much heights (k,) miss those wanted, standard deviations."""
-    along_s, along_t = data.basis(0, knots.degree_s, knots.s), data.basis(1, knots.degree_t, knots.t)
-    return np.einsum("nk,nk->n", along_s @ heights.reshape(knots.shape), along_t) - data.wanted
-
-
-def _solve(knots: Knots, data: _Data) -> _Solution:
+def _solve(knots: Knots, data: Equations) -> _Solution:
     """Least squares on given knots."""
-    A, b = _normal_equations(knots, data)
+    A, b = normal_equations(knots, data)
     information = A + smoothness(knots, data.size)
     scale = 1.0 / np.sqrt(information.diagonal())
     scaled = information * scale[:, None] * scale
@@ -304,13 +207,13 @@ def _solve(knots: Knots, data: _Data) -> _Solution:
     return _Solution(knots, heights, information, A, max(0.0, chi_square))
 
 
-_Steps = Callable[[Knots, _Data, Array], Iterator[Knots]]
+_Steps = Callable[[Knots, Equations, Array], Iterator[Knots]]
 
 
-def _climb(best: _Solution, data: _Data, kinds: Sequence[_Steps]) -> _Solution:
+def _climb(best: _Solution, data: Equations, kinds: Sequence[_Steps]) -> _Solution:
     """The solution to which the best steps lead while they pay; those of later kinds only where no earlier one does."""
     for _ in range(MOST_STEPS):
-        misfit = _misfit(best.knots, best.heights, data) ** 2
+        misfit = misfits(best.knots, best.heights, data) ** 2
         for steps in kinds:
             found = [_solve(knots, data) for knots in steps(best.knots, data, misfit)]
             first = min(found, key=lambda one: one.criterion, default=best)
@@ -322,7 +225,7 @@ def _climb(best: _Solution, data: _Data, kinds: Sequence[_Steps]) -> _Solution:
     return best
 
 
-def _single_steps(knots: Knots, data: _Data, misfit: Array) -> Iterator[Knots]:
+def _single_steps(knots: Knots, data: Equations, misfit: Array) -> Iterator[Knots]:
     """Knots with a higher degree along s or t, or with the span of most excess halved."""
     for axis in (0, 1):
         old = _along(knots, axis)
@@ -332,7 +235,7 @@ def _single_steps(knots: Knots, data: _Data, misfit: Array) -> Iterator[Knots]:
                     yield _with(knots, axis, new)
 
 
-def _double_steps(knots: Knots, data: _Data, misfit: Array) -> Iterator[Knots]:
+def _double_steps(knots: Knots, data: Equations, misfit: Array) -> Iterator[Knots]:
     """The same twice along s, or twice along t: across each other two steps that do not pay hardly ever do."""
     for axis in (0, 1):
         old = _along(knots, axis)
@@ -346,7 +249,7 @@ def _double_steps(knots: Knots, data: _Data, misfit: Array) -> Iterator[Knots]:
             yield _with(knots, axis, new)
 
 
-def _fewer_steps(knots: Knots, data: _Data, misfit: Array) -> Iterator[Knots]:
+def _fewer_steps(knots: Knots, data: Equations, misfit: Array) -> Iterator[Knots]:
     """Knots without one of the inner ones, or of a lower degree along s or t: what later steps have made needless."""
     for axis in (0, 1):
         old, least = _along(knots, axis), _along(data.least, axis)
@@ -375,7 +278,7 @@ def _with(knots: Knots, axis: int, line: _Line) -> Knots:
     return knots._replace(degree_s=line.degree, s=line.knots)
 
 
-def _room(knots: Knots, data: _Data, axis: int, steps: int) -> bool:
+def _room(knots: Knots, data: Equations, axis: int, steps: int) -> bool:
     """Whether the data stand at more places than there will be control points along a direction, and are enough."""
     more = knots.size * (knots.shape[axis] + steps) / knots.shape[axis]
     return more <= min(MOST, len(data.root) / LEAST_BLOCKS) and data.places[axis] > knots.shape[axis] + steps
@@ -386,7 +289,7 @@ def _raised(line: _Line) -> _Line | None:
     return _Line(line.degree + 1, with_degree(line.knots, line.degree)) if line.degree < HIGHEST_DEGREE else None
 
 
-def _halved(line: _Line, data: _Data, axis: int, misfit: Array) -> _Line | None:
+def _halved(line: _Line, data: Equations, axis: int, misfit: Array) -> _Line | None:
     """The span with most chi square (n,) over its share halved, if both halves have data."""
     u = np.clip(data.feet.uv[:, axis], 0.0, 1.0)
     if len(line.knots) == 2 * line.degree + 2:
@@ -397,7 +300,7 @@ def _halved(line: _Line, data: _Data, axis: int, misfit: Array) -> _Line | None:
         worst = int(np.argmax(np.bincount(span, misfit - 1.0, len(breaks) - 1)))
         middle = float(breaks[worst] + breaks[worst + 1]) / 2.0
         inside = u[span == worst]
-        places = _places(inside)
+        places = number_of_places(inside)
     if places < 4 or not (inside < middle).any() or not (inside > middle).any():
         return None
     return _Line(line.degree, with_knot(line.knots, line.degree, middle))

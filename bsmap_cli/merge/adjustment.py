@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from bsmap_cli.fit.heights import basis_matrix
-from bsmap_cli.fit.selection import smoothness
+from bsmap_cli.fit.smoothness import smoothness
 from bsmap_cli.merge.information import ROBUST, Joined, Told, unit_errors
 from bsmap_cli.model import Array, BSplineSurface, Crease, HeightCovariance, PosePart
 

@@ -34,7 +34,8 @@ from bsmap_cli.fit.heights import (
     with_degree,
     with_knot,
 )
-from bsmap_cli.fit.selection import HIGHEST_DEGREE, MOST, PRICE, smoothness
+from bsmap_cli.fit.selection import HIGHEST_DEGREE, MOST, PRICE
+from bsmap_cli.fit.smoothness import smoothness
 from bsmap_cli.merge.bases import BasedFace, height_basis, normals, places_on
 from bsmap_cli.merge.frames import Frame
 from bsmap_cli.model import Array, HeightCovariance, PosePart

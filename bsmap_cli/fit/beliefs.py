@@ -8,6 +8,7 @@ from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.blocks import Blocks
 from bsmap_cli.fit.clutter import NOISY
 from bsmap_cli.fit.context import FLATNESS
+from bsmap_cli.fit.labels import OUTLIER
 from bsmap_cli.fit.misses import Misses, without_outliers
 from bsmap_cli.fit.selection import PRICE, Fitted
 from bsmap_cli.model import IntArray
@@ -39,26 +40,21 @@ def scale_left(fitted: Sequence[Fitted], blocks: Sequence[Blocks]) -> float:
     return float(np.sqrt(np.clip(np.average(square[sound], weights=freedom[sound]), LEAST_SQUARE, 1.0)))
 
 
-def without_misfits(grid: BeamGrid, misses: Misses, sigma: float, noise: float, share: float = 0.0) -> IntArray:
-    """Labels without outliers, nor the faces whose other beams miss them by more than noise and unevenness.
+def believed(grid: BeamGrid, misses: Misses, sigma: float, noise: float) -> IntArray:
+    """Labels without outliers, nor the faces that many of their beams deny, or that miss them by more than the noise.
 
     A surface that bridges a step, or a few of them, lies within the gate of outliers of most beams, but not as near to
-    them as the noise would have it.  share : of its beams that a face must explain.
+    them as noise and unevenness would have it.
     """
     labels = without_outliers(misses, sigma)
-    member = (misses.labels >= 0) & grid.hit
-    number = np.bincount(misses.labels[member])
-    member &= labels >= 0
-    of = labels[member]
-    count = np.bincount(of, minlength=len(number))
+    of_faces = misses.labels[member := (misses.labels >= 0) & grid.hit]
+    before = np.bincount(of_faces)
+    near = np.abs(misses.beyond) < OUTLIER * noise
+    count = np.bincount(misses.labels[near & member], minlength=len(before))
     some = np.maximum(count, 1)
-    square = np.bincount(of, misses.beyond[member] ** 2, len(number)) / some
+    square = np.bincount(misses.labels[near & member], misses.beyond[near & member] ** 2, len(before)) / some
     most = NOISY**2 * (noise**2 + FLATNESS**2) * (1.0 + SURE * np.sqrt(2.0 / some))
-    denied = np.append((count < share * number) | (square > most), False)
+    after = np.bincount(labels[(labels >= 0) & grid.hit], minlength=len(before))
+    denied = np.append((after < KEPT * before) | (square > most), False)
     labels[denied[labels]] = -1
     return labels
-
-
-def believed(grid: BeamGrid, misses: Misses, sigma: float, noise: float) -> IntArray:
-    """The same, without the faces that many of their beams deny, too."""
-    return without_misfits(grid, misses, sigma, noise, KEPT)

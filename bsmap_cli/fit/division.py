@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bsmap_cli.fit.absorption import absorb
 from bsmap_cli.fit.beams import BeamGrid
-from bsmap_cli.fit.beliefs import believed, scale_left, without_misfits
+from bsmap_cli.fit.beliefs import believed, scale_left
 from bsmap_cli.fit.blocks import Blocks, make_blocks, single_beams, thinned
 from bsmap_cli.fit.clutter import find_planes
 from bsmap_cli.fit.crossings import find_crossings
@@ -24,7 +24,7 @@ from bsmap_cli.fit.labels import (
     runs_of,
 )
 from bsmap_cli.fit.lowmodels import CylinderFrame, fit_cylinder_frame, fit_plane_frame, turned
-from bsmap_cli.fit.misses import find_misses, without_alike, without_slipped_ends
+from bsmap_cli.fit.misses import find_misses, without_alike, without_outliers, without_slipped_ends
 from bsmap_cli.fit.pieces import find_pieces
 from bsmap_cli.fit.regions import find_regions
 from bsmap_cli.fit.seeds import PAIR_BEAMS
@@ -79,7 +79,7 @@ def find_faces(grid: BeamGrid) -> Faces:
     for step in range(ROUNDS):
         fields = [f.field for f in fitted]
         misses = find_misses(grid, labels, fields, before=misses)
-        divided = adopt(grid, without_misfits(grid, misses, sigma, noise), fields, sigma)
+        divided = adopt(grid, without_outliers(misses, sigma), fields, sigma)
         divided = move_breaks(grid, divided, fields, sigma)
         misses = find_misses(grid, divided, fields, misses)
         misses = misses._replace(labels=without_alike(grid, misses, sigma))

@@ -1,10 +1,10 @@
 """How beams miss their faces, and which leave them for it: outliers, neighbours that miss alike, ends that slip."""
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.context import FLATNESS
@@ -16,8 +16,8 @@ from bsmap_cli.model import Array, IntArray
 SLIPPED = 2.0
 """Standard deviations, of noise and flatness together, within which the last beam stays before a jump
 that misses its face towards the next."""
-ALIKE = (((3, 3), 0.0), ((7, 1), 0.0), ((3, 13), FLATNESS))
-"""Scans and beams of neighbourhoods whose misses are added up, and metres that these may have in common."""
+ALIKE = ((3, 3), (7, 1))
+"""Scans and beams of neighbourhoods whose misses are added up."""
 CHUNK = 20_000
 """Beams whose neighbourhoods are added up at a time."""
 
@@ -67,49 +67,17 @@ def without_alike(grid: BeamGrid, misses: Misses, sigma: float) -> IntArray:
     """Labels without the beams that miss their face by less than an outlier, but together with their neighbours.
 
     The side of a recess that is no deeper than the gate of outliers would otherwise be shared out to the faces above
-    and below it. What many have in common may be the unevenness of a real wall.
+    and below it.
     """
-    m, n = misses.labels.shape
-    out = misses.labels.copy()
-    halo, step = max(up for (up, _), _ in ALIKE) // 2, max(1, CHUNK // n)
-    # So many scans at once, with those around them, stay in the processor's cache.
-    for first in range(0, m, step):
-        low = max(0, first - halo)
-        part, inner = slice(low, min(m, first + step + halo)), slice(first - low, first - low + step)
-        labels = misses.labels[part]
-        member = (labels >= 0) & grid.hit[part]
-        miss = np.clip(misses.beyond[part] / sigma, -OUTLIER, OUTLIER)
-        alike = np.zeros(labels.shape, dtype=bool)
-        for (_, uneven), (total, count) in zip(ALIKE, _window_sums(labels, member, miss), strict=True):
-            most = OUTLIER * np.sqrt(count) + uneven / sigma * count
-            alike |= member & (np.abs(total) > most) & (miss * total > 0.0)
-        out[first : first + step][alike[inner]] = -1
-    return out
-
-
-def _window_sums(labels: IntArray, member: NDArray[np.bool_], values: Array) -> list[tuple[Array, Array]]:
-    """For each of ALIKE (m, n) sums of the values of members of one face in a window around each beam; their number.
-
-    In each scan those count that lie in one run of the face, or of the rest.
-    """
-    m, n = labels.shape
-    change = np.flatnonzero(np.diff(labels, axis=1, prepend=-2).ravel())
-    length = np.diff(change, append=m * n)
-    start, stop = np.repeat(change, length), np.repeat(change + length, length)
-    sums = np.zeros((2, m * n + 1))
-    np.cumsum(np.where(member, values, 0.0), out=sums[0, 1:])
-    np.cumsum(member, out=sums[1, 1:])
-    place, out = np.arange(m * n), []
-    for (up, side), _ in ALIKE:
-        low, high = np.maximum(place - side // 2, start), np.minimum(place + side // 2 + 1, stop)
-        own = (sums.take(high, axis=1) - sums.take(low, axis=1)).reshape(2, m, n)
-        total = own.copy()
-        for step in range(1, up // 2 + 1):
-            same = labels[step:] == labels[:-step]
-            total[:, step:] += own[:, :-step] * same
-            total[:, :-step] += own[:, step:] * same
-        out.append((total[0], total[1]))
-    return out
+    labels = misses.labels
+    member = (labels >= 0) & grid.hit
+    miss = np.clip(misses.beyond / sigma, -OUTLIER, OUTLIER)
+    own = np.where(member, labels, -1)
+    alike = np.zeros(labels.shape, dtype=bool)
+    for window in ALIKE:
+        total, count = _window_sums(own, miss, window)
+        alike |= member & (np.abs(total) > OUTLIER * np.sqrt(count)) & (miss * total > 0.0)
+    return np.where(alike, -1, labels)
 
 
 def without_slipped_ends(grid: BeamGrid, misses: Misses, fields: Sequence[HeightField], sigma: float) -> IntArray:
@@ -136,3 +104,21 @@ def without_slipped_ends(grid: BeamGrid, misses: Misses, fields: Sequence[Height
         gone[meets] = np.abs(to_other) > OUTLIER * sigma
         labels[row[gone], column[gone]] = -1
     return labels
+
+
+def _window_sums(own: IntArray, values: Array, window: tuple[int, int]) -> tuple[Array, Array]:
+    """(m, n) sums of the values of beams of the same face in a window around each, and their number."""
+    (m, n), reach = own.shape, (window[0] // 2, window[1] // 2)
+    margins = [(r, r) for r in reach]
+    faces, padded = np.pad(own.astype(np.int32), margins, constant_values=-1), np.pad(values, margins)
+    total, count = np.zeros(own.shape), np.zeros(own.shape)
+    step = max(1, CHUNK // n)
+    # So many scans at once stay in the processor's cache.
+    for first in range(0, m, step):
+        rows = slice(first, min(first + step, m))
+        centre = faces[reach[0] :][rows, reach[1] : reach[1] + n]
+        for i, k in itertools.product(range(window[0]), range(window[1])):
+            same = faces[i:][rows, k : k + n] == centre
+            total[rows] += np.where(same, padded[i:][rows, k : k + n], 0.0)
+            count[rows] += same
+    return total, count

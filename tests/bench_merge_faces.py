@@ -12,8 +12,8 @@ bytes: of the map as .json.gz over 12 bytes a point of the cloud.
 Creases of the merged map: T: corners in which the border of a face goes straight on. sides: of all creases. open:
 those along which the borders of the two faces' meshes are not the same vertices to the last bit. gap: largest distance
 between the two borders. edges: of the true scene, samples with ends of beams within 8 cm on both sides; share within
-2 cm of a crease, and median distance, of the map laid over the scene by the trajectory. Before: the creases of all data
-sets.
+2 cm of a crease, or of a crease or a rim, and median distance to both, of the map laid over the scene by the
+trajectory. Before: the creases of all data sets.
 """
 
 import sys
@@ -31,6 +31,7 @@ from true_edges import distance_to_lines, seen_edges
 from bsmap_cli import open3d_loader
 from bsmap_cli.cloud import make_cloud
 from bsmap_cli.core.bspline import evaluate_surface
+from bsmap_cli.core.trims import rims_of
 from bsmap_cli.evaluate import align, distance_to_mesh, surface_samples, transform_points
 from bsmap_cli.export.tessellation import tessellate_map
 from bsmap_cli.fit import divide, fit_surfaces
@@ -173,8 +174,13 @@ def seam_figures(surface_map):
 
 
 def edge_figures(surface_map, samples, pose):
-    d = distance_to_lines(samples, [transform_points(pose, crease.points) for crease in surface_map.creases])
-    return f"edges {np.mean(d < 0.02):.2%}, median {1e3 * np.median(d):.2f} mm"
+    lines = [crease.points for crease in surface_map.creases]
+    rims = [rim.points for surface in surface_map.surfaces for rim in rims_of(surface)]
+    creases, both = (
+        distance_to_lines(samples, [transform_points(pose, line) for line in some]) for some in (lines, lines + rims)
+    )
+    near = f"edges {np.mean(creases < 0.02):.2%}, with rims {np.mean(both < 0.02):.2%}"
+    return f"{near}, median {1e3 * np.median(both):.2f} mm"
 
 
 def true_cloud(scene, seed):

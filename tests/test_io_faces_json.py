@@ -30,7 +30,7 @@ def face(name, crease):
         np.array([[[0.0, 0.0, 1.0]]]), root @ root.T, (PosePart("d", np.zeros(2), np.eye(3) * 1e-6),)
     )
     knots = np.array([0.0, 0.0, 1.0, 1.0])
-    loop = TrimLoop(CORNERS, np.array([crease, -1, -1, -1]))
+    loop = TrimLoop(CORNERS, np.array([crease, -1, -1, -1]), np.array([0.0, 0.04, 0.04, 0.0123]))
     return BSplineSurface(name, ("d",), 1, 1, knots, knots, net, covariance, Residuals(9, 0.0, 0.0, 0.0, 0.0), (loop,))
 
 
@@ -48,6 +48,7 @@ def test_faces_come_back(path):
     (first, _), (crease,) = read.surfaces, read.creases
     np.testing.assert_array_equal(first.trims[0].parameters, CORNERS)
     np.testing.assert_array_equal(first.trims[0].creases, [0, -1, -1, -1])
+    np.testing.assert_array_equal(first.trims[0].rims, [0.0, 0.04, 0.04, 0.012])
     deviations = np.sqrt(np.diag(made.covariance.matrix))
     off = np.abs(first.covariance.matrix - made.covariance.matrix)
     assert np.all(off < 0.01 * np.outer(deviations, deviations))
@@ -125,6 +126,11 @@ UPWARDS = {"directions": [[[0, 0, 100_000]]], "weights": []}
         ([[0, 0], [4000, 0], [0, 4000], [-4000, 1]], (*FIRST, "trims", 0, "parameters"), r"lie outside \[0, 1\]"),
         ([0, 0, 2, 0], (*FIRST, "trims", 0, "creases"), r"creases\[2\] is 2, wanted 0 or a number of a crease"),
         ([0, 0, 0], (*FIRST, "trims", 0, "creases"), "creases is 3, wanted 4"),
+        ([[0, 1, 40]], (*FIRST, "trims", 0, "rims"), r"rims\[0\] is 0, 1, 40, wanted sides without crease and a width"),
+        ([[3, 2, 40]], (*FIRST, "trims", 0, "rims"), r"rims\[0\] is 3, 2, 40, wanted sides without"),
+        ([[3, 0, 40]], (*FIRST, "trims", 0, "rims"), r"rims\[0\] is 3, 0, 40, wanted sides without"),
+        ([[3, 1, 0]], (*FIRST, "trims", 0, "rims"), r"rims\[0\] is 3, 1, 0, wanted sides without"),
+        ([[3, 1]], (*FIRST, "trims", 0, "rims"), "rims is 1 x 2, wanted any x 3"),
         ([[[0, 0, 200_000]]], (*FIRST, "covariance", "directions"), "directions are not of length 1"),
         (
             [[[0, 0, 100_000]]] * 3,

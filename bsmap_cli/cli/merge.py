@@ -40,6 +40,7 @@ def make_map_file(inputs: tuple[Path, ...], output: Path, merge_params: MergePar
 
     def compute(track: Track) -> Result:
         from bsmap_cli.cli.stage import map_figures
+        from bsmap_cli.core.trims import rims_of
         from bsmap_cli.io.surfaces_json import read_surfaces, write_surfaces
         from bsmap_cli.merge import merge_surfaces
 
@@ -56,6 +57,7 @@ def make_map_file(inputs: tuple[Path, ...], output: Path, merge_params: MergePar
             **map_figures(merged),
             "creases": len(merged.creases),
             "corners": len(merged.corners),
+            "rims": sum(len(rims_of(surface)) for surface in merged.surfaces),
             "merged": outcomes.count("merged"),
             "refused": outcomes.count("refused"),
             **({"moved": outcomes.count("moved")} if len(inputs) > 1 else {}),

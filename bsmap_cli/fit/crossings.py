@@ -30,6 +30,7 @@ class Crossings(NamedTuple):
     along, across : (m, n) number of the crossing on the edge to the next beam, to the next scan; -1 for none.
      points : (k, 3) in map.  faces : (k, 2) of the beam itself and of the next one.
     passed : (k, 2) whether the scan that hits the other face passes through this one: it ends before the crossing.
+    widths : (k,) metres of the bracket of a rim, in which one face ends (the other is -1); 0 for crossings.
     """
 
     along: IntArray
@@ -37,10 +38,12 @@ class Crossings(NamedTuple):
     points: Array
     faces: IntArray
     passed: NDArray[np.bool_]
+    widths: Array
 
     def reached(self, face: int, number: IntArray) -> NDArray[np.bool_]:
         """Whether a face reaches crossings (j,)."""
-        return ~np.any((self.faces[number] == face) & self.passed[number], axis=1)
+        own = self.faces[number] == face
+        return np.any(own, axis=1) & ~np.any(own & self.passed[number], axis=1)
 
 
 def find_crossings(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField]) -> Crossings:
@@ -56,7 +59,8 @@ def find_crossings(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightFiel
         points.append(at)
         faces.append(pair)
     pairs = np.concatenate(faces)
-    return Crossings(numbers[0], numbers[1], np.concatenate(points), pairs, np.zeros(pairs.shape, dtype=bool))
+    passed, widths = np.zeros(pairs.shape, dtype=bool), np.zeros(len(pairs))
+    return Crossings(numbers[0], numbers[1], np.concatenate(points), pairs, passed, widths)
 
 
 def _on_edges(

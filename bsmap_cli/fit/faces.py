@@ -1,6 +1,7 @@
 """PointCloud -> SurfaceMap: one trimmed B-spline surface for each smooth face of each data set."""
 
 import logging
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from bsmap_cli.fit.movement import Movement, divide
 from bsmap_cli.fit.surface import residuals_of
 from bsmap_cli.fit.surfaces import spline_of
 from bsmap_cli.fit.trimming import Trims, trim
-from bsmap_cli.model import BSplineSurface, Crease, DataSet, Decision, IntArray, PointCloud, SurfaceMap, TrimLoop
+from bsmap_cli.model import BSplineSurface, Crease, DataSet, Decision, IntArray, PointCloud, SurfaceMap
 from bsmap_cli.params import FitParams
 from bsmap_cli.track import Track, silent
 
@@ -81,7 +82,7 @@ def fit_set(cloud: PointCloud, scans: IntArray, name: str, grid: BeamGrid, first
     for number in kept:
         spline, covariance = spline_of(faces.fitted[number], pose)
         residuals = residuals_of(np.abs(feet[number].beyond))
-        loops = tuple(TrimLoop(loop.parameters, used[loop.creases]) for loop in trims.loops[number])
+        loops = tuple(replace(loop, creases=used[loop.creases]) for loop in trims.loops[number])
         surfaces.append(BSplineSurface(names[number], (name,), *spline, covariance, residuals, loops))
     return _Set(surfaces, creases, _figures(grid, faces))
 

@@ -1,5 +1,6 @@
 """Trim loops of faces and the creases that they share."""
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -16,10 +17,13 @@ from bsmap_cli.fit.feet import Feet, Table, parameters_at, tabulate
 from bsmap_cli.fit.heights import HeightField
 from bsmap_cli.fit.labels import met_at, places_of_faces
 from bsmap_cli.fit.outline import Nodes, outlines
+from bsmap_cli.fit.rims import straightened, with_rims
 from bsmap_cli.model import Array, IntArray, TrimLoop
 
 BORDER_TOLERANCE, CREASE_TOLERANCE = 0.004, 0.001
 """Metres by which a simplified line may leave the outline."""
+STEP = 2
+"""Beams on the way from a rim in one scan to that in the next one, at most."""
 LEAST_AREA = 4e-4
 """Square metres; smaller loops are dropped."""
 
@@ -47,11 +51,14 @@ def trim(grid: BeamGrid, faces: Faces, feet: Sequence[Feet]) -> Trims:
     doubtful = doubtful_cells(clean, faces.labels, table, crossings, ends)
     crossings = within_ends(clean, faces.labels, table, crossings, ends)
     crossings = passed_through(clean, faces.labels, table, crossings, ends)
+    crossings = with_rims(clean, faces.labels, table, crossings)
     believed = ~(doubtful | beyond_bare_ends(clean, faces.labels, fields, ends))
     nodes = _nodes(grid, faces.labels, table, fields, feet, crossings)
     pairs = crossings.faces.min(axis=1) * len(fields) + crossings.faces.max(axis=1)
     pairs[crossings.passed.any(axis=1)] = -1
-    sides = _Sides(nodes, pairs, crossings.points, {}, [])
+    rim = crossings.widths > 0.0
+    pairs[rim] = len(fields) ** 2 + crossings.faces[rim].max(axis=1)
+    sides = _Sides(nodes, pairs, crossings.points, crossings.widths, {}, [])
     loops = []
     for number, around in enumerate(outlines(len(fields), faces.labels, crossings, nodes, believed)):
         size = fields[number].high - fields[number].low
@@ -79,7 +86,7 @@ def _nodes(
     before, behind = (grid.before.place[grid.before.number[missing] - k] for k in (1, 0))
     share = ((missing - before) / (behind - before))[:, None]
     uv[missing] = (1.0 - share) * uv[before] + share * uv[behind]
-    pair = crossings.faces.ravel()
+    pair = np.where(crossings.faces < 0, crossings.faces.max(axis=1, keepdims=True), crossings.faces).ravel()
     at_crossings = parameters_at(table, pair, np.repeat(crossings.points, 2, axis=0))
     return Nodes(uv.reshape(m, n, 2), at_crossings.reshape(-1, 2, 2), crossings.faces)
 
@@ -103,11 +110,13 @@ class _Sides(NamedTuple):
     """What turning loops of numbers into polygons needs; `creases` and `lines` grow.
 
     pairs : (k,) of each crossing the two faces, as one number; -1 where one of them ends before.  points : (k, 3).
+    widths : (k,) of rims.
     """
 
     nodes: Nodes
     pairs: IntArray
     points: Array
+    widths: Array
     creases: dict[tuple[int, ...], int]
     lines: list[CreaseLine]
 
@@ -128,18 +137,50 @@ def _loop(sides: _Sides, face: int, size: Array, vertices: IntArray) -> TrimLoop
     """Loop with simplified sides; None where little is left.  size : (2,) metres of the face's rectangle."""
     if abs(signed_area(sides.nodes.at(face, vertices) * size)) < LEAST_AREA:
         return None
-    kept: list[int] = []
-    marks: list[int] = []
-    for run, pair in _runs(sides, vertices):
-        if pair >= 0 and len(run) > 1:
-            number, line = _crease(sides, run)
-        else:
-            number, line = -1, run[simplify(sides.nodes.at(face, run) * size, BORDER_TOLERANCE)]
-        kept += line.tolist()
-        marks += [number] * (len(line) - 1) + [-1]
-    if len(kept) < 3:
+    vertices = _along_rims(sides, vertices)
+    made = [_line(sides, face, size, run, pair) for run, pair in _runs(sides, vertices)]
+    at = np.concatenate([line.at for line in made])
+    if len(at) < 3:
         return None
-    return TrimLoop(np.clip(sides.nodes.at(face, np.array(kept)), 0.0, 1.0), np.array(marks))
+    # The side from the end of a line to the next one's beginning follows nothing.
+    marks, rims = (
+        np.concatenate([np.append(np.full(len(line.at) - 1, line[k]), none) for line in made if len(line.at)])
+        for k, none in ((1, -1), (2, 0.0))
+    )
+    return TrimLoop(np.clip(at, 0.0, 1.0), marks.astype(np.int64), rims if rims.any() else None)
+
+
+class _Line(NamedTuple):
+    """Part of a loop: parameters (k, 2), the crease that it runs along or -1, metres of its bracket if it is a rim."""
+
+    at: Array
+    crease: int
+    rim: float
+
+
+def _line(sides: _Sides, face: int, size: Array, run: IntArray, pair: int) -> _Line:
+    """A stretch of a loop with few vertices."""
+    at = sides.nodes.at(face, run)
+    if pair >= 0 and len(run) > 1:
+        widths = sides.widths[run - sides.first]
+        if not widths.any():
+            number, line = _crease(sides, run)
+            return _Line(sides.nodes.at(face, line), number, 0.0)
+        return _Line(straightened(at * size, widths) / size, -1, float(widths.mean()))
+    return _Line(at[simplify(at * size, BORDER_TOLERANCE)], -1, 0.0)
+
+
+def _along_rims(sides: _Sides, vertices: IntArray) -> IntArray:
+    """The vertices of a loop without beams between two rims: from scan to scan the last beam's number changes."""
+    rim = np.zeros(len(vertices), dtype=bool)
+    crossing = vertices >= sides.first
+    rim[crossing] = sides.widths[vertices[crossing] - sides.first] > 0.0
+    rims = np.flatnonzero(rim)
+    keep = np.ones(len(vertices), dtype=bool)
+    for start, stop in itertools.pairwise([*rims.tolist(), *(rims[:1] + len(rim)).tolist()]):
+        between = np.arange(start + 1, stop) % len(rim)
+        keep[between] = len(between) > STEP or bool(crossing[between].any())
+    return vertices[keep]
 
 
 def _runs(sides: _Sides, vertices: IntArray) -> list[tuple[IntArray, int]]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from bsmap_cli.core.bspline import clamped_knots
 from bsmap_cli.core.uncertainty import FROM_THREE
-from bsmap_cli.io.trim_loops import Sheet, sheet_of, unpack_loop
+from bsmap_cli.io.trim_loops import Sheet, sheet_of, unpack_loop, unpack_rims
 from bsmap_cli.io.whole_numbers import CURVES, DIRECTIONS, POINTS, POSES, ROOTS, WEIGHTS, from_pose_root, from_whole
 from bsmap_cli.model import (
     Array,
@@ -127,7 +127,11 @@ def _loop(plain: Any, sheet: Sheet, lines: Sequence[Array], where: str) -> TrimL
     loop = unpack_loop(numbers, creases.astype(np.int64), sheet, lines)
     if np.any((loop.parameters < 0.0) | (loop.parameters > 1.0)):
         raise MalformedError(f"{where}: parameters lie outside [0, 1]")
-    return loop
+    rims = np.zeros((0, 3)) if _get(plain, "rims", list, where) == [] else _array(plain, "rims", (None, 3), where)
+    try:
+        return unpack_rims(loop, np.rint(rims).astype(np.int64).tolist())
+    except ValueError as error:
+        raise MalformedError(f"{where}: {error}") from error
 
 
 def _numbers(plain: Any, key: str, count: int, limit: int, what: str, where: str) -> IntArray:

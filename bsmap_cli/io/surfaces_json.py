@@ -1,6 +1,6 @@
 """The artifact of `fit` and `merge`: B-spline surfaces as JSON (.surfaces.json, .map.json; .gz by name).
 
-    {"format": "bsmap-surfaces", "version": 7, "units": "metres, radians, frame map",
+    {"format": "bsmap-surfaces", "version": 8, "units": "metres, radians, frame map",
      "bsmap-provenance": {...},
      "data_sets": [{"name", "movement": "translation" | "rotation", "first_scan", "last_scan", "points"}, ...],
      "poses": [{"data_set", "centre": [x, y], "trajectory": name,
@@ -38,7 +38,9 @@
                               way in metres along the control points of one v, or of one u; trim_loops.py tells from
                               where each vertex is counted,
                 "creases": k numbers of the creases along the sides from each vertex to the next: 0 for none, 1 for the
-                              first, -1 where the loop runs along it backwards}, ...]
+                              first, -1 where the loop runs along it backwards,
+                "rims": [[first side, how many, metres within which the edge of the thing runs along them, in units of
+                          1 mm], ...] of what creases tell nothing of}, ...]
                              no trims: the whole surface; else what the loops together wind around counter-clockwise
      "residuals": [points, mean, rms, percentile_95, maximum]}
 
@@ -64,7 +66,7 @@ from bsmap_cli.core.uncertainty import is_plane
 from bsmap_cli.errors import BadInputError, MissingInputError
 from bsmap_cli.io.artifact import Provenance, atomic_output, plain_json
 from bsmap_cli.io.surfaces_check import MalformedError, parse_map
-from bsmap_cli.io.trim_loops import Sheet, pack_loop, sheet_of
+from bsmap_cli.io.trim_loops import Sheet, pack_loop, pack_rims, sheet_of
 from bsmap_cli.io.whole_numbers import (
     CURVES,
     DIRECTIONS,
@@ -90,7 +92,7 @@ from bsmap_cli.model import (
 )
 
 FORMAT = "bsmap-surfaces"
-VERSION = 7
+VERSION = 8
 
 
 def write_surfaces(path: Path | str, surfaces: SurfaceMap, provenance: Provenance | None = None) -> None:
@@ -161,7 +163,7 @@ def _surface(surface: BSplineSurface, lines: Sequence[Array]) -> dict[str, Any]:
 
 def _loop(loop: TrimLoop, sheet: Sheet, lines: Sequence[Array]) -> dict[str, Any]:
     numbers, creases = pack_loop(loop, sheet, lines)
-    return {"parameters": numbers.tolist(), "creases": creases.tolist()}
+    return {"parameters": numbers.tolist(), "creases": creases.tolist(), "rims": pack_rims(loop)}
 
 
 def _crease(crease: Crease, numbers: Mapping[str, int]) -> dict[str, Any]:

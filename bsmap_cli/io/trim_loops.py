@@ -6,12 +6,16 @@ control point and those at the ends of its row and column. Over planes that is e
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from bsmap_cli.model import Array, IntArray, TrimLoop
 
+RIMS = 1e3
+"""Units in a metre of the brackets of rims."""
 TRIMS = 2e3
 """Steps in a metre of the parameters of trims, about: so many to the length of the surface."""
 
@@ -70,6 +74,35 @@ def unpack_loop(numbers: Array, creases: IntArray, sheet: Sheet, lines: Sequence
     for k, (number, told) in enumerate(zip(numbers, _told(creases, sheet, lines), strict=True)):
         steps[k] = last = number + (last if np.isnan(told[0]) else told)
     return TrimLoop(steps / sheet.steps, np.abs(creases) - 1)
+
+
+def pack_rims(loop: TrimLoop) -> list[list[int]]:
+    """First side, number of sides and width in whole units of the rims of a loop."""
+    if loop.rims is None:
+        return []
+    # What is hardly anything is a rim all the same.
+    widths = np.where(loop.rims > 0.0, np.maximum(np.rint(loop.rims * RIMS), 1.0), 0.0).astype(np.int64)
+    bounds = [0, *(np.flatnonzero(np.diff(widths)) + 1).tolist(), len(widths)]
+    return [[a, b - a, int(widths[a])] for a, b in pairwise(bounds) if widths[a]]
+
+
+def unpack_rims(loop: TrimLoop, numbers: Sequence[Sequence[int]]) -> TrimLoop:
+    """The loop with the rims that `pack_rims` gave as numbers.
+
+    Raises
+    ------
+    ValueError
+        Tells of what is no rim: it has no side, reaches beyond the last one, has no width, or is a crease.
+    """
+    if not len(numbers):
+        return loop
+    rims = np.zeros(len(loop.creases))
+    for k, (first, count, width) in enumerate(numbers):
+        sides = slice(first, first + count)
+        if min(first, count - 1, width - 1, len(rims) - first - count) < 0 or (loop.creases[sides] >= 0).any():
+            raise ValueError(f"rims[{k}] is {first:g}, {count:g}, {width:g}, wanted sides without crease and a width")
+        rims[sides] = width / RIMS
+    return replace(loop, rims=rims)
 
 
 def _whole_runs(creases: IntArray, lines: Sequence[Array]) -> list[IntArray]:

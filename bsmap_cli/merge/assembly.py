@@ -17,6 +17,7 @@ from bsmap_cli.merge.layers import CLOSE, cut_back
 from bsmap_cli.merge.open_borders import fewer_vertices
 from bsmap_cli.merge.outlines import creased_sides, loops_around, member_of, seen, snapped
 from bsmap_cli.merge.regions import Region
+from bsmap_cli.merge.rims import along_rims
 from bsmap_cli.merge.shapes import Shape, spline_shape
 from bsmap_cli.merge.topology import Topology, find_topology
 from bsmap_cli.merge.untangling import untangled
@@ -83,7 +84,8 @@ def assemble(
         found = find_topology(outlines, sides, shapes, params.gap)
     made = []
     for number, rings in found.rings.items():
-        simple = untangled(fewer_vertices(rings, shapes[number]), shapes[number])
+        led = along_rims(rings, members[number], shapes[number])
+        simple = untangled(fewer_vertices(led, shapes[number]), shapes[number])
         made.append(trimmed(whole[number], simple, shapes[number]))
     return made, _creases(found, names), found.corners
 

@@ -26,7 +26,7 @@ def trimmed(surface: BSplineSurface, rings: Sequence[Ring], shape: Shape) -> BSp
             low, high = np.minimum(lowest, 0.0), np.maximum(highest, 1.0)
             surface = extended(surface, low, high)
     inside = (np.clip((uv - low) / (high - low), 0.0, 1.0) for uv in found)
-    loops = (TrimLoop(uv, ring.edges) for uv, ring in zip(inside, rings, strict=True))
+    loops = (TrimLoop(uv, ring.edges, ring.rims) for uv, ring in zip(inside, rings, strict=True))
     return replace(surface, trims=tuple(loops))
 
 

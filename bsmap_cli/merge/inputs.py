@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bsmap_cli.model import Array, BSplineSurface, Crease, DataSet, Decision, HeightCovariance, SurfaceMap, TrimLoop
+from bsmap_cli.model import Array, BSplineSurface, Crease, DataSet, Decision, HeightCovariance, SurfaceMap
 
 
 class United(NamedTuple):
@@ -92,7 +92,7 @@ def _renumbered(surface: BSplineSurface, first: int) -> BSplineSurface:
     """The surface, its creases counted from `first`."""
     if first == 0 or not surface.trims:
         return surface
-    loops = (TrimLoop(loop.parameters, loop.creases + first * (loop.creases >= 0)) for loop in surface.trims)
+    loops = (replace(loop, creases=loop.creases + first * (loop.creases >= 0)) for loop in surface.trims)
     return replace(surface, trims=tuple(loops))
 
 

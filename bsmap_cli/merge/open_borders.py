@@ -21,17 +21,18 @@ def fewer_vertices(rings: Sequence[Ring], shape: Shape) -> list[Ring]:
 
 def _fewer(ring: Ring, flat: Array) -> Ring:
     """One ring, flat : (k, 2) its points in the plane; as it was where hardly anything of it would be left."""
-    n, fixed = len(flat), _fixed(ring.edges, flat)
+    n, fixed = len(flat), _fixed(ring, flat)
     keep = np.zeros(n, dtype=bool)
     for start, stop in pairwise([*fixed.tolist(), int(fixed[0]) + n]):
         chain = np.arange(start, stop + 1) % n
         keep[chain] |= simplify(flat[chain], TOLERANCE)
-    return Ring(ring.points[keep], ring.edges[keep]) if np.count_nonzero(keep) > 2 else ring
+    return ring.of(keep) if np.count_nonzero(keep) > 2 else ring
 
 
-def _fixed(edges: IntArray, flat: Array) -> IntArray:
-    """Vertices that stay: those at creases; of a ring without the first one, and the one farthest from it."""
-    held = np.flatnonzero((edges >= 0) | (np.roll(edges, 1) >= 0))
+def _fixed(ring: Ring, flat: Array) -> IntArray:
+    """Vertices that stay: those at creases and rims; of a ring without the first one, and the one farthest from it."""
+    known = ring.edges >= 0 if ring.rims is None else (ring.edges >= 0) | (ring.rims > 0.0)
+    held = np.flatnonzero(known | np.roll(known, 1))
     if len(held):
         return held
     return np.array([0, int(np.argmax(np.linalg.norm(flat - flat[0], axis=1)))])

@@ -22,17 +22,21 @@ FINE = 0.03
 
 
 class Member(NamedTuple):
-    """Loops of one face of a data set in map: corners (k, 3), and the faces of the map that meet in each side."""
+    """Loops of one face of a data set in map: corners (k, 3), the faces of the map that meet in each side, and metres
+    (k,) of the bracket of each side that is a rim, else 0.
+    """
 
     corners: list[Array]
     sides: list[list[FacePair | None]]
+    rims: list[Array]
 
 
 def member_of(surface: BSplineSurface, pairs: Sequence[FacePair | None]) -> Member:
     """Loops of a surface; pairs : of each crease of the map."""
     corners = [evaluate_surface(surface, *np.clip(loop.parameters, 0.0, 1.0).T) for loop in surface.trims]
     sides = [[pairs[c] if c >= 0 else None for c in loop.creases.tolist()] for loop in surface.trims]
-    return Member(corners, sides)
+    rims = [np.zeros(len(loop.creases)) if loop.rims is None else loop.rims for loop in surface.trims]
+    return Member(corners, sides, rims)
 
 
 def snapped(member: Member, face: int, shapes: Shapes) -> Member:
@@ -48,7 +52,7 @@ def snapped(member: Member, face: int, shapes: Shapes) -> Member:
         for met_faces, at in by_faces.items():
             new[at] = onto([shapes[f] for f in met_faces], points[at])
         corners.append(new)
-    return Member(corners, member.sides)
+    return member._replace(corners=corners)
 
 
 class Seen(NamedTuple):

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bsmap_cli.merge.curves import Curve, between, locate
 from bsmap_cli.merge.regions import GRID
@@ -12,10 +13,18 @@ from bsmap_cli.model import Array, IntArray
 
 
 class Ring(NamedTuple):
-    """Loop of a face: points (k, 3) on it, and the number of the edge (k,) from each to the next one, or -1."""
+    """Loop of a face: points (k, 3) on it, and the number of the edge (k,) from each to the next one, or -1.
+
+    rims : (k,) of each side, as in TrimLoop.
+    """
 
     points: Array
     edges: IntArray
+    rims: Array | None = None
+
+    def of(self, kept: NDArray[np.bool_]) -> "Ring":
+        """The ring of those vertices (k,) that are kept; the sides from them follow what they did."""
+        return Ring(self.points[kept], self.edges[kept], None if self.rims is None else self.rims[kept])
 
 
 class Loop(NamedTuple):

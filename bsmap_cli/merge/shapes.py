@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from bsmap_cli.core.bspline import evaluate_grid, evaluate_surface
 from bsmap_cli.fit.heights import HeightField, offset
+from bsmap_cli.merge.bases import places_on
 from bsmap_cli.model import Array, BSplineSurface
 
 GRID = 40
@@ -47,6 +48,13 @@ def flattened(shape: Shape, points: Array) -> Array:
     if isinstance(shape, HeightField):
         return shape.base.local(points)[:, :2]
     return parameters_of(shape, points) * lengths_of(shape)
+
+
+def placed(shape: Shape, flat: Array) -> Array:
+    """(n, 3) points on a surface at flattened places (n, 2)."""
+    if isinstance(shape, HeightField):
+        return places_on(shape, (flat - shape.low) / (shape.high - shape.low))
+    return evaluate_surface(shape.surface, *np.clip(flat / lengths_of(shape), 0.0, 1.0).T)
 
 
 def lengths_of(shape: SplineShape) -> Array:

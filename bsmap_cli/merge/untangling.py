@@ -37,7 +37,7 @@ def _free(edges: IntArray) -> NDArray[np.bool_]:
 
 
 def _without(ring: Ring, vertex: int) -> Ring:
-    return Ring(np.delete(ring.points, vertex, axis=0), np.delete(ring.edges, vertex))
+    return ring.of(np.arange(len(ring.edges)) != vertex % len(ring.edges))
 
 
 def _without_spikes(ring: Ring, flat: Array) -> Ring:

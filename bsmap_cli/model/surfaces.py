@@ -86,13 +86,18 @@ class TrimLoop:
     parameters : (k, 2) u, v in [0, 1].
     creases : (k,) number in SurfaceMap.creases of the crease that the side from this vertex to the next one runs
     along, -1 for an open border.
+    rims : (k,) metres within which a side of an open border follows the edge of the thing, 0 where the face may go on
+    behind what was seen; None where no side follows one.
     """
 
     parameters: Array
     creases: IntArray
+    rims: Array | None = None
 
     def __post_init__(self) -> None:
         check(self, parameters=(None, 2), creases=(len(self.parameters),))
+        if self.rims is not None:
+            check(self, rims=(len(self.parameters),))
 
 
 @dataclass(frozen=True)

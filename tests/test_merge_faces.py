@@ -343,3 +343,12 @@ def test_slit_whose_sides_coincide_to_the_grid_is_cut_to_what_touches():
     found = without_mitres(part, whole)
     assert found.is_valid
     assert found.area == pytest.approx(part.area, abs=1e-5)
+
+
+def test_strips_that_are_narrower_than_the_samples_of_faces_keep_their_plane():
+    # Places inside lie in one line, around which a plane may turn.
+    rng = np.random.default_rng(0)
+    noise = 1e-3 * rng.normal(size=(2, 2, 2))
+    strips = [wall(f"set-{k}/1", 0.0, 2.0, heights=(1.0, 1.04), noise=noise[k]) for k in range(2)]
+    (surface,) = merge_surfaces([map_of(*strips)], MergeParams()).surfaces
+    np.testing.assert_allclose(surface.control_points[..., 1], noise.mean(axis=0), atol=2e-3)

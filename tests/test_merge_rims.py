@@ -83,3 +83,10 @@ def test_a_map_that_is_folded_in_keeps_its_rims(tmp_path):
     np.testing.assert_allclose(the_rim(read).points, the_rim(first).points, atol=1e-3)
     again = merge_surfaces([read, map_of(ended("set-9/1", 2.01))], MergeParams())
     np.testing.assert_allclose(the_rim(again).points[:, 0], 2.0, atol=0.008)
+
+
+def test_a_face_smaller_than_its_brackets_stays_a_face():
+    small = [wall(f"set-{k}/1", 0.0, 0.03, heights=(0.0, 0.04)) for k in range(2)]
+    small = [replace(w, trims=(replace(w.trims[0], rims=np.full(4, 0.05)),)) for w in small]
+    (surface,) = merged(*small).surfaces
+    assert all(len(loop.parameters) > 2 for loop in surface.trims)

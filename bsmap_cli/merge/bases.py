@@ -29,7 +29,8 @@ class BasedFace(NamedTuple):
 
     region : in s and t of the field's base, metres.  facing : +1 or -1 where the base's normal points to the sensor or
     away, 0 where the centre of the data set does not tell.
-    samples : (n, 3) in map, those of the border last.  areas : (n,) square metres each stands for, 0 at the border.
+    samples : (n, 3) in map, those of the border last.  areas : (n,) square metres each stands for, 0 at the border of
+    faces that are wide enough.
     variances : (n,) sensor part, square metres.
     """
 
@@ -73,11 +74,21 @@ def based_face(surface: BSplineSurface) -> BasedFace | None:
     st = np.concatenate([inner, border])
     uv = (st - field.low) / size
     samples = field.base.place(np.column_stack([st, evaluate(field, uv)[0]]))
-    areas = np.concatenate([np.full(len(inner), region.area / max(len(inner), 1)), np.zeros(len(border))])
+    # In a strip that is hardly wider than the grid the places inside lie in one line, which tells no plane.
+    counted = len(st) if _in_line(inner, step) else len(inner)
+    areas = np.append(np.full(counted, region.area / counted), np.zeros(len(st) - counted))
     variances = height_variances(surface, field, uv)
     off = float(field.base.local(sensor_position(surface))[2] - field.base.local(samples)[:, 2].mean())
     facing = 0 if abs(off) < LEAST_HEIGHT else int(np.sign(off))
     return BasedFace(surface, field, region, facing, samples, areas, variances)
+
+
+def _in_line(places: Array, step: float) -> bool:
+    """Whether places (n, 2) spread across their main direction by less than half a step."""
+    if len(places) < 3:
+        return True
+    spread = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)[-1]
+    return bool(spread < 0.5 * step * np.sqrt(len(places)))
 
 
 def field_of(surface: BSplineSurface) -> HeightField:

@@ -26,10 +26,8 @@ way that leaves it, as where a single scan stands out.
 """
 ALONG = 0.9
 """Cosine between a border and a rim that it follows."""
-OFF, MOST = 0.02, 0.2
-"""Metres by which borders may leave a straight rim; and the share of them that may stand out farther: a single data set
-may err there, but where all leave something open it is open.
-"""
+OFF = 0.02
+"""Metres by which borders may leave a straight rim inwards."""
 LEAST = 0.05
 """Metres; shorter rims are none."""
 ROUNDS, LEAST_OFF = 8, 0.1
@@ -102,7 +100,14 @@ def _seen(members: Iterable[Member], shape: Shape) -> _Seen | None:
 
 
 def _led(ring: Ring, flat: Array, seen: _Seen, shape: Shape) -> Ring:
-    """A ring, its vertices at places (k, 2), whose open sides beside rims run along these."""
+    """A ring, its vertices at places (k, 2), whose open sides beside rims run along these; as it was where hardly
+    anything of it would be left.
+    """
+    led = _led_along(ring, flat, seen, shape)
+    return led if len(led.points) > 2 else ring
+
+
+def _led_along(ring: Ring, flat: Array, seen: _Seen, shape: Shape) -> Ring:
     points, flat, edges = _divided(ring, flat)
     follows = _follow(flat, edges, seen)
     if not follows.any():
@@ -159,36 +164,38 @@ def _follow(flat: Array, edges: IntArray, seen: _Seen) -> NDArray[np.bool_]:
 
 def _rim(border: Array, seen: _Seen) -> tuple[Array, float]:
     """Vertices (j, 2) of the rim along a border (k, 2), and metres of the brackets."""
-    bounds = _bends(border, 0, len(border) - 1)
-    lines, widths = zip(*(_through(border[a : b + 1], seen) for a, b in pairwise(bounds)), strict=True)
+    bounds = _bends(border, 0, len(border) - 1, seen)
+    lines, brackets = zip(*(_through(border[a : b + 1], seen) for a, b in pairwise(bounds)), strict=True)
     joints = (_joint(lines[k], lines[k + 1], border[at]) for k, at in enumerate(bounds[1:-1]))
     out = np.array([lines[0].foot(border[0]), *joints, lines[-1].foot(border[-1])])
-    return out, float(np.median(np.concatenate(widths)))
+    widths = np.concatenate(brackets)
+    return out, float(np.median(widths)) if len(widths) else 0.0
 
 
-def _bends(border: Array, first: int, last: int) -> list[int]:
-    """Vertices, ascending, between which a border is straight."""
+def _bends(border: Array, first: int, last: int, seen: _Seen) -> list[int]:
+    """Vertices, ascending, between which a border runs along straight rims, or is straight."""
     part, chord = border[first : last + 1], border[last] - border[first]
-    out = _middle_line(part, np.full(len(part), OFF), chord).right(part)
-    straight = out.min() > -OFF and out.max() < NEAR and np.mean(out > OFF) < MOST
-    if last - first < 2 or straight:
+    line, widths = _through(part, seen)
+    out = line.right(part)
+    # A single data set may have seen too much, but where all leave something open it is open.
+    if last - first < 2 or (out.min() > -OFF and out.max() < (NEAR if len(widths) else OFF)):
         return [first, last]
-    away = np.abs(np.cross(np.append(chord, 0.0), np.column_stack([part - border[first], np.zeros(len(part))]))[:, 2])
+    away = np.abs((part - border[first]) @ np.array([chord[1], -chord[0]]))
     cut = first + min(max(int(np.argmax(away)), 1), len(part) - 2)
-    return _bends(border, first, cut)[:-1] + _bends(border, cut, last)
+    return _bends(border, first, cut, seen)[:-1] + _bends(border, cut, last, seen)
 
 
 def _through(border: Array, seen: _Seen) -> tuple[_Line, Array]:
-    """The line through what data sets saw of the rim along a straight border (k, 2), and widths of the brackets."""
+    """The line through what data sets saw of a rim along a border (k, 2), and widths of the brackets; where nothing of
+    it goes the same way, through the border itself, and none.
+    """
     own = _middle_line(border, np.full(len(border), OFF), border[-1] - border[0])
     lists = seen.tree.query_ball_point(border, NEAR)
     near = np.unique(np.concatenate([np.array(some, dtype=np.int64) for some in lists]))
     near = near[seen.ways[near] @ own.way > ALONG]
     if len(near) < 2:
-        return own, seen.widths[near]
-    line = _middle_line(seen.places[near], seen.widths[near], own.way)
-    far = np.abs(line.right(border)).max() > NEAR + OFF
-    return (own if far else line), seen.widths[near]
+        return own, np.zeros(0)
+    return _middle_line(seen.places[near], seen.widths[near], own.way), seen.widths[near]
 
 
 def _middle_line(places: Array, widths: Array, way: Array) -> _Line:

@@ -49,8 +49,10 @@ def test_no_sample_of_a_turn_strays_from_the_truth(cause, start):
     assert distance.max() < 0.025
 
 
-def test_no_sample_of_the_room_strays_and_what_was_seen_stays():
-    place = simulated_place("room")
+@pytest.mark.parametrize("seed", [0, 7])
+def test_no_sample_of_the_room_strays_and_what_was_seen_stays(seed):
+    # In the seventh a beam of the rest lay between floor and chest: a cell cut the chest's corner, 97 mm deep.
+    place = simulated_place("room", seed=seed)
     for movement in divide(place.cloud.scan_poses, 5.0):
         made = fit_set(place.cloud, movement.scans, "set", make_grid(place.cloud, movement.scans), 0)
         samples = surface_samples(SurfaceMap(tuple(made.surfaces), ()), 0.02)

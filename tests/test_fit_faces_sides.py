@@ -10,7 +10,7 @@ from bsmap_cli.evaluate import distance_to_mesh
 from bsmap_cli.fit.beams import make_grid
 from bsmap_cli.fit.division import find_faces
 from bsmap_cli.fit.labels import _best_breaks, feet_of_faces, move_breaks
-from bsmap_cli.fit.sides import on_their_sides
+from bsmap_cli.fit.sides import closed_at_creases, on_their_sides
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +55,25 @@ def test_a_beam_that_the_other_side_does_not_explain_stays(corridor):
     points = grid.points.copy()
     points[4, at] += 0.5 * grid.directions[4, at]
     assert on_their_sides(replace(grid, points=points), moved, fields, sigma)[4, at] == moved[4, at]
+
+
+@pytest.mark.parametrize(("before", "behind"), [(1, 0), (1, 1), (0, 2), (2, 1)])
+def test_beams_of_the_rest_in_a_crease_come_to_the_face_on_their_side(corridor, before, behind):
+    grid, labels, fields, sigma = corridor
+    lost = labels.copy()
+    for scan in range(20):
+        at = border(labels, scan)
+        lost[scan, at - before : at + behind] = -1
+    np.testing.assert_array_equal(closed_at_creases(grid, lost, fields, sigma), labels)
+
+
+def test_what_stands_in_a_crease_keeps_it_open(corridor):
+    grid, labels, fields, sigma = corridor
+    at = border(labels, 4)
+    lost, points = labels.copy(), grid.points.copy()
+    lost[4, at - 1 : at + 1] = -1
+    points[4, at] -= 0.1 * grid.directions[4, at]
+    np.testing.assert_array_equal(closed_at_creases(replace(grid, points=points), lost, fields, sigma), lost)
 
 
 def test_a_tangle_of_beams_beside_a_crease_becomes_one_border(corridor):

@@ -29,7 +29,7 @@ from bsmap_cli.fit.pieces import find_pieces
 from bsmap_cli.fit.regions import find_regions
 from bsmap_cli.fit.seeds import PAIR_BEAMS
 from bsmap_cli.fit.selection import LEAST_BLOCKS, Fitted, fit_heights, refit
-from bsmap_cli.fit.sides import on_their_sides
+from bsmap_cli.fit.sides import closed_at_creases, on_their_sides
 from bsmap_cli.fit.unions import low_order_cost
 from bsmap_cli.model import Array, IntArray
 
@@ -105,7 +105,9 @@ def find_faces(grid: BeamGrid) -> Faces:
         points = grid.points[(labels == number) & grid.hit]
         if len(points) < LEAST_BLOCKS * one.field.knots.size or _stands_on_edge(one.field, points):
             labels[labels == number] = -1
-    labels = enclosed(grid, on_their_sides(grid, labels, [one.field for one in fitted], sigma))
+    fields = [one.field for one in fitted]
+    labels = on_their_sides(grid, labels, fields, sigma)
+    labels = enclosed(grid, closed_at_creases(grid, labels, fields, sigma))
     labels, kept = _kept(labels, grid)
     return Faces(labels, [fitted[k] for k in kept], noise)
 

@@ -51,6 +51,36 @@ def on_their_sides(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightFiel
     return fill(grid, labels)
 
 
+def closed_at_creases(grid: BeamGrid, labels: IntArray, fields: Sequence[HeightField], sigma: float) -> IntArray:
+    """Labels, the few beams of the rest between two faces that cross there given to these, each on its side.
+
+    Where they leave one of them unexplained, something stands in the crease, and they stay.
+    """
+    table, labels = tabulate(fields), labels.copy()
+    (row, start, stop, label), near = _joined(runs_of(labels))
+    near = near[(start[near + 1] > stop[near]) & (label[near] != label[near + 1])]
+    half = [np.minimum((stop - start)[of] // 2, 2 * BEYOND) for of in (near, near + 1)]
+    gap = stop[near, None] + np.arange(GAP)
+    at = np.column_stack([gap, stop[near] - 1 - half[0], start[near + 1] + half[1]])
+    between = np.column_stack([gap < start[near + 1, None], np.ones((len(near), 2), dtype=bool)])
+    r = np.broadcast_to(row[near, None], at.shape)
+    at = np.minimum(at, labels.shape[1] - 1)
+    k, i = np.nonzero(between & grid.hit[r, at])
+    to_first, to_second = np.full((2, *at.shape), np.nan)
+    for way, face in ((to_first, label[near]), (to_second, label[near + 1])):
+        way[k, i] = met_at(grid, table, face[k], r[k, i], at[k, i]).beyond
+    sign = np.sign(to_first - to_second)
+    first = sign[:, :GAP] == sign[:, GAP, None]
+    miss = np.where(first, to_first[:, :GAP], to_second[:, :GAP])
+    # One border between them: all beams of the first face come before all of the second.
+    ordered = np.all(np.diff(np.where(between[:, :GAP], first, False).astype(np.int8), axis=1) <= 0, axis=1)
+    explained = np.all((np.abs(miss) < OUTLIER * sigma) | np.isnan(miss), axis=1)
+    crossing = sign[:, GAP] * sign[:, GAP + 1] < 0.0
+    k, i = np.nonzero((ordered & explained & crossing)[:, None] & np.isfinite(miss))
+    labels[r[k, i], at[k, i]] = np.where(first[k, i], label[near[k]], label[near[k] + 1])
+    return fill(grid, labels)
+
+
 def _joined(runs: Runs) -> tuple[Runs, IntArray]:
     """Runs, those of one face between which only a few beams are as one; and which have another one behind them."""
     row, start, stop, label = runs

@@ -1,11 +1,13 @@
 """Meshes keep their tolerance, hold the knots, and turn their front to the sensor."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from bsmap_cli.core.bspline import clamped_knots, evaluate_grid, evaluate_surface
 from bsmap_cli.errors import ParameterError
-from bsmap_cli.export.orientation import frontness, turn_to_sensor, viewpoints
+from bsmap_cli.export.orientation import frontness, turn_to_sensor, turned, viewpoints
 from bsmap_cli.export.tessellation import (
     Mesh,
     grid_parameters,
@@ -148,6 +150,18 @@ def test_room_faces_inwards():
         a, b, c = np.moveaxis(mesh.vertices[mesh.triangles], 1, 0)
         inwards = np.array([2.0, 3.0, 1.25]) - a
         assert np.all(np.einsum("nd,nd->n", np.cross(b - a, c - a), inwards) > 0), surface.name
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_side_decides_the_front_wherever_the_data_set_lies(side):
+    part = PosePart("d", np.array([0.3, 0.3]), np.zeros((3, 3)))
+    flat = flat_surface([[0, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0]], parts=[part])
+    P, mesh = flat.control_points, tessellate(flat, 0.01)
+    seen = side * np.cross(P[1, 0] - P[0, 0], P[0, 1] - P[0, 0])
+    for height in (1.0, -1.0):
+        front = turned(mesh, replace(flat, side=side), {"d": np.array([0.3, 0.3, height])})
+        a, b, c = np.moveaxis(front.vertices[front.triangles], 1, 0)
+        assert np.all(np.cross(b - a, c - a) @ seen > 0.0)
 
 
 def test_heavier_data_set_decides_the_front():

@@ -5,7 +5,9 @@ from functools import cache
 import numpy as np
 import pytest
 from face_scenes import corridor_set, simulated_place
+from scipy.spatial import cKDTree
 
+from bsmap_cli.core.beams import beam_origins
 from bsmap_cli.core.trims import inside_trims
 from bsmap_cli.core.uncertainty import sensor_covariance
 from bsmap_cli.errors import BsmapError
@@ -41,6 +43,20 @@ def test_faces_lie_on_the_truth_and_nothing_hangs_in_the_air(made):
     distance = distance_to_mesh(surface_samples(surface_map, 0.05), place.vertices, place.triangles)
     assert distance.mean() < 0.0012
     assert np.quantile(distance, 0.99) < 0.01
+
+
+@pytest.mark.parametrize("made", [corridor, room])
+def test_surfaces_tell_from_which_side_the_beams_came(made):
+    place, surface_map = made()
+    cloud = place.cloud
+    tree = cKDTree(cloud.points)
+    for surface in surface_map.surfaces:
+        mesh = tessellate(surface, 0.002)
+        a, b, c = np.moveaxis(mesh.vertices[mesh.triangles], 1, 0)
+        middle, normal = (a + b + c) / 3.0, surface.side * np.cross(b - a, c - a)
+        nearest = tree.query(middle)[1]
+        beam = beam_origins(cloud, nearest) - cloud.points[nearest]
+        assert np.sum(normal * beam) > 0.0, surface.name
 
 
 def test_corridor_needs_few_control_points_and_leaves_few_beams():

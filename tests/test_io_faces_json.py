@@ -58,6 +58,20 @@ def test_faces_come_back(path):
     np.testing.assert_array_equal(read.corners, [[0.0, 0.0, 0.0]])
 
 
+@pytest.mark.parametrize("side", [-1, 0, 1])
+def test_side_comes_back(tmp_path, side):
+    write_surfaces(tmp_path / "s.json", SurfaceMap((replace(face("a", -1), side=side),), ()))
+    assert read_surfaces(tmp_path / "s.json").surfaces[0].side == side
+
+
+def test_side_that_is_none_is_refused(path):
+    plain = json.loads(path.read_text())
+    plain["surfaces"][0]["side"] = 2
+    path.write_text(json.dumps(plain))
+    with pytest.raises(BadInputError, match=r"surfaces\[0\] \(a\): side is 2, wanted 1, -1 or 0"):
+        read_surfaces(path)
+
+
 def test_corners_are_stored_once(path):
     plain = json.loads(path.read_text())
     assert plain["corners"] == [[0, 0, 0]]

@@ -103,7 +103,15 @@ def test_invalid_ranges_are_no_return(tmp_path: Path) -> None:
     scans = replace(lasers()[0], topic="/s", frame_id="laser", range_min=0.5, range_max=10.0)
     row = np.array([0.5, 0.49, 10.0, 10.01, np.nan, np.inf, -np.inf, -1.0, 0.0], np.float32)
     write_log(path, [OdometryRow(START, (0, 0, 0)), ScanRow(START, scans, row)], {"laser": np.eye(4)})
-    np.testing.assert_array_equal(np.isfinite(read_log(path).horizontal.ranges[0]), [1, 0, 1, 0, 0, 0, 0, 0, 0])
+    np.testing.assert_array_equal(np.isfinite(read_log(path).horizontal.ranges[0]), [1, 0, 0, 0, 0, 0, 0, 0, 0])
+
+
+def test_zero_is_no_return_even_where_the_limits_allow_it(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    scans = replace(lasers()[0], topic="/s", frame_id="laser", range_min=0.0, range_max=10.0)
+    row = np.array([0.0, 1e-3, 9.99], np.float32)
+    write_log(path, [OdometryRow(START, (0, 0, 0)), ScanRow(START, scans, row)], {"laser": np.eye(4)})
+    np.testing.assert_array_equal(np.isfinite(read_log(path).horizontal.ranges[0]), [0, 1, 1])
 
 
 def test_scans_of_other_angles_are_dropped_and_short_ones_padded(

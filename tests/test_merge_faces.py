@@ -104,6 +104,19 @@ def test_two_sides_of_a_thin_wall_stay_two(thickness):
     assert all("opposite" in d.reason or "farther apart" in d.reason for d in result.decisions)
 
 
+@pytest.mark.parametrize(("sides", "count"), [((1, 1), 1), ((1, -1), 2), ((-1, -1), 1)])
+def test_side_of_the_beams_counts_and_not_where_the_middle_of_the_data_set_lies(sides, count):
+    # Passing a corner, a robot sees the wall round it at the end of its way, whose middle lies behind that wall.
+    walls = wall("a/01", 0.0, 3.0, sensor=1.5), wall("b/01", 2.0, 4.0, sensor=-1.5)
+    found = merged(*(replace(one, side=side) for one, side in zip(walls, sides, strict=True)))
+    assert len(found.surfaces) == count
+    for surface in found.surfaces:
+        P = surface.control_points
+        seen = surface.side * np.cross(P[-1, 0] - P[0, 0], P[0, -1] - P[0, 0])[1]
+        before = [side for side, one in zip(sides, walls, strict=True) if set(one.data_sets) & set(surface.data_sets)]
+        assert np.sign(seen) == -before[0]  # S_u x S_v of these walls points along -y
+
+
 def test_step_of_four_centimetres_stays_apart_under_uncertain_poses():
     """Both parts are seen by both data sets, with poses so uncertain that the gate alone would let them pass."""
     pose = np.diag([0.02**2, 0.02**2, 1e-8])

@@ -1,4 +1,4 @@
-"""Which side of a surface the sensor saw: the triangles' front is turned to it."""
+"""The triangles' front is turned to the side from which a surface was seen."""
 
 from collections.abc import Iterable, Mapping
 
@@ -27,10 +27,21 @@ def _viewpoint(data_set: str, surfaces: Iterable[BSplineSurface]) -> Array:
     return np.append(seen[0][1].centre, (heights.min() + heights.max()) / 2.0)
 
 
+def turned(mesh: Mesh, surface: BSplineSurface, seen_from: Mapping[str, Array]) -> Mesh:
+    """Mesh of a surface, its front to the side from which that was seen; by `turn_to_sensor` where it does not tell."""
+    if surface.side == 0:
+        return turn_to_sensor(mesh, surface.covariance.pose, seen_from)
+    return _reversed(mesh) if surface.side < 0 else mesh
+
+
 def turn_to_sensor(mesh: Mesh, parts: Iterable[PosePart], seen_from: Mapping[str, Array]) -> Mesh:
     """The mesh, reversed where its data sets, by their weights, saw its back; as it is where that is undecided."""
     front = sum(part.weight * frontness(mesh, seen_from[part.data_set]) for part in parts)
-    return Mesh(mesh.vertices, mesh.triangles[:, ::-1]) if front < -UNDECIDED else mesh
+    return _reversed(mesh) if front < -UNDECIDED else mesh
+
+
+def _reversed(mesh: Mesh) -> Mesh:
+    return Mesh(mesh.vertices, mesh.triangles[:, ::-1])
 
 
 def frontness(mesh: Mesh, viewpoint: Array) -> float:

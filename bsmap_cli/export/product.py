@@ -7,7 +7,7 @@ from typing import Any
 from bsmap_cli.errors import BadInputError, ParameterError
 from bsmap_cli.export.meshes import WRITERS, NamedMesh
 from bsmap_cli.export.nurbs_json import write_nurbs_json
-from bsmap_cli.export.orientation import turn_to_sensor, viewpoints
+from bsmap_cli.export.orientation import turned, viewpoints
 from bsmap_cli.export.tessellation import tessellate_map
 from bsmap_cli.model import SurfaceMap
 from bsmap_cli.params import ExportParams
@@ -68,7 +68,7 @@ def make_meshes(surface_map: SurfaceMap, tolerance: float, *, track: Track = sil
     seen_from = viewpoints(surface_map)
     made = tessellate_map(surface_map, tolerance, track=track)
     return [
-        NamedMesh(surface.name, turn_to_sensor(mesh, surface.covariance.pose, seen_from))
+        NamedMesh(surface.name, turned(mesh, surface, seen_from))
         for surface, mesh in zip(surface_map.surfaces, made, strict=True)
         if len(mesh.triangles)
     ]

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from bsmap_cli.core.sides import side_towards
 from bsmap_cli.errors import BsmapError
 from bsmap_cli.fit.beams import BeamGrid, make_grid
 from bsmap_cli.fit.division import Faces, find_faces
@@ -20,6 +21,9 @@ from bsmap_cli.params import FitParams
 from bsmap_cli.track import Track, silent
 
 logger = logging.getLogger(__name__)
+
+VOTES = 100
+"""Beams that tell from which side a face was seen, about."""
 
 
 class _Set(NamedTuple):
@@ -81,9 +85,12 @@ def fit_set(cloud: PointCloud, scans: IntArray, name: str, grid: BeamGrid, first
     surfaces = []
     for number in kept:
         spline, covariance = spline_of(faces.fitted[number], pose)
+        beams = grid.directions[(faces.labels == number) & grid.hit]
+        step = max(1, len(beams) // VOTES)
+        side = side_towards(spline, feet[number].uv[::step], -beams[::step])
         residuals = residuals_of(np.abs(feet[number].beyond))
         loops = tuple(replace(loop, creases=used[loop.creases]) for loop in trims.loops[number])
-        surfaces.append(BSplineSurface(names[number], (name,), *spline, covariance, residuals, loops))
+        surfaces.append(BSplineSurface(names[number], (name,), *spline, covariance, residuals, loops, side))
     return _Set(surfaces, creases, _figures(grid, faces))
 
 

@@ -98,7 +98,7 @@ def without_slipped_ends(grid: BeamGrid, misses: Misses, fields: Sequence[Height
         ends = (other != face) & grid.hit[row, following]
         row, column, following, face, other = (of[ends] for of in (row, column, following, face, other))
         own, next_one = misses.beyond[row, column], met_at(grid, table, face, row, following).beyond
-        gone = (own * next_one > 0.0) & (np.abs(next_one) > np.abs(own))
+        gone = (np.sign(own) * np.sign(next_one) > 0.0) & (np.abs(next_one) > np.abs(own))
         meets = np.flatnonzero(gone & (other >= 0))
         to_other = met_at(grid, table, other[meets], row[meets], column[meets]).beyond
         gone[meets] = np.abs(to_other) > OUTLIER * sigma

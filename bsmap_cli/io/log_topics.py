@@ -117,8 +117,9 @@ _TAKERS: dict[str, Callable[[LogTopics, McapMessage, Any], None]] = {
 def laser_scans(path: Path, name: str, topic: ScanTopic, mount: Array) -> tuple[LaserScans, IntArray]:
     """Scans of a topic as one array, and their log times (n,) ns.
 
-    Ranges out of limits become nan, short scans are padded with nan, and scans whose angles are not those of most of
-    the topic's scans are dropped with a warning.
+    Ranges out of limits become nan, and so do 0 and the largest one, which stand for no return in many logs; short
+    scans are padded with nan, and scans whose angles are not those of most of the topic's scans are dropped with a
+    warning.
     """
     geometry = np.array(topic.geometry, dtype=float)
     rounded = [(round(row[0], 5), round(row[1], 7)) for row in topic.geometry]
@@ -134,7 +135,8 @@ def laser_scans(path: Path, name: str, topic: ScanTopic, mount: Array) -> tuple[
         raise BadInputError(f"{path}: {name}: its scans have no beams")
     low, high = geometry[keep, 3, None], geometry[keep, 4, None]
     with np.errstate(invalid="ignore"):
-        ranges[~((ranges >= low) & (ranges <= high))] = np.nan
+        # Many drivers tell a beam without return by the largest range or by 0: a robot would carry a wall around it.
+        ranges[~((ranges >= low) & (ranges > 0.0) & (ranges < high))] = np.nan
     angle_min, angle_increment, time_increment, *_ = topic.geometry[keep[0]]
     scans = LaserScans(
         time_ns=np.array(topic.time_ns, dtype=np.int64)[keep],

@@ -113,7 +113,15 @@ def _surface(plain: Any, where: str, lines: Sequence[Array], poses: dict[str, Po
             _loop(loop, sheet, lines, f"{where}: trims[{i}]")
             for i, loop in enumerate(_get(plain, "trims", list, where))
         ),
+        side=_side(plain, where),
     )
+
+
+def _side(plain: dict[str, Any], where: str) -> int:
+    side = _get(plain, "side", int, where)
+    if side not in (-1, 0, 1):
+        raise MalformedError(f"{where}: side is {side}, wanted 1, -1 or 0")
+    return side
 
 
 def _loop(plain: Any, sheet: Sheet, lines: Sequence[Array], where: str) -> TrimLoop:

@@ -42,7 +42,8 @@
                 "rims": [[first side, how many, metres within which the edge of the thing runs along them, in units of
                           1 mm], ...] of what creases tell nothing of}, ...]
                              no trims: the whole surface; else what the loops together wind around counter-clockwise
-     "residuals": [points, mean, rms, percentile_95, maximum]}
+     "residuals": [points, mean, rms, percentile_95, maximum],
+     "side":                   1: S_u x S_v points to the sensor that saw the surface, -1: away from it, 0: not known}
 
 model/surfaces.py tells what each is. What has units is in whole numbers of them; D: the first one, and of each other
 the difference to the one before. Others are rounded to what they are worth: correlations to 1e-6, knots to 1e-10,
@@ -158,6 +159,7 @@ def _surface(surface: BSplineSurface, lines: Sequence[Array]) -> dict[str, Any]:
         "covariance": _covariance(surface.covariance) | {"weights": _weights(surface)},
         "residuals": [int(surface.residuals.points), *_significant(list(vars(surface.residuals).values())[1:], 2)],
         "trims": [_loop(loop, sheet, lines) for loop in surface.trims],
+        "side": int(surface.side),
     }
 
 

@@ -8,7 +8,7 @@ import shapely
 
 from bsmap_cli.fit.heights import HeightField, PlaneBase
 from bsmap_cli.fit.surfaces import spline_over
-from bsmap_cli.merge.bases import BasedFace, normals
+from bsmap_cli.merge.bases import BasedFace, base_side, normals
 from bsmap_cli.merge.curves import FacePair
 from bsmap_cli.merge.extent import trimmed
 from bsmap_cli.merge.frames import Frame
@@ -159,7 +159,20 @@ def _surface(group: Group, name: str) -> BSplineSurface:
     spline, covariance = spline_over(group.joined.field, *covariance_of(group.joined, group.told))
     data_sets = sorted({data_set for face in group.faces for data_set in face.surface.data_sets})
     residuals = _pooled([face.surface.residuals for face in group.faces])
-    return BSplineSurface(name, tuple(data_sets), *spline, covariance, residuals)
+    side = int(np.sign(_votes(group))) * base_side(spline, group.field.base)
+    return BSplineSurface(name, tuple(data_sets), *spline, covariance, residuals, side=side)
+
+
+def _votes(group: Group) -> float:
+    """Square metres of members that sensors saw from where the joined base's normal points, less those of others."""
+    base = group.field.base
+    return float(
+        sum(
+            face.area * face.facing * np.sign(normals(base, at)[0] @ normals(face.field.base, at)[0])
+            for face in group.faces
+            for at in [face.samples[:1]]
+        )
+    )
 
 
 def _pooled(residuals: Sequence[Residuals]) -> Residuals:

@@ -6,7 +6,8 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
-from bsmap_cli.core.bspline import evaluate_grid
+from bsmap_cli.core.bspline import Surface, evaluate_grid, evaluate_surface
+from bsmap_cli.core.sides import side_towards
 from bsmap_cli.core.uncertainty import pose_covariance, pose_difference
 from bsmap_cli.fit.heights import Base, CylinderBase, HeightField, Knots, PlaneBase, basis_matrix, evaluate
 from bsmap_cli.merge.facing import sensor_position
@@ -20,6 +21,7 @@ LEAST_HEIGHT = 0.3
 """Metres off the base at which a data set's centre tells the side from which it saw a wall."""
 LEVEL = 1e-6
 """Largest z of a unit vector that counts as level."""
+MIDDLE = np.array([[0.5, 0.5]])
 PER_CONTROL_POINT = 6
 """Places for each control point and direction, from which the heights over a cylinder are found."""
 
@@ -28,7 +30,7 @@ class BasedFace(NamedTuple):
     """A trimmed surface over a plane or an upright cylinder.
 
     region : in s and t of the field's base, metres.  facing : +1 or -1 where the base's normal points to the sensor or
-    away, 0 where the centre of the data set does not tell.
+    away, 0 where that is not known.
     samples : (n, 3) in map, those of the border last.  areas : (n,) square metres each stands for, 0 at the border of
     faces that are wide enough.
     variances : (n,) sensor part, square metres.
@@ -78,9 +80,23 @@ def based_face(surface: BSplineSurface) -> BasedFace | None:
     counted = len(st) if _in_line(inner, step) else len(inner)
     areas = np.append(np.full(counted, region.area / counted), np.zeros(len(st) - counted))
     variances = height_variances(surface, field, uv)
-    off = float(field.base.local(sensor_position(surface))[2] - field.base.local(samples)[:, 2].mean())
-    facing = 0 if abs(off) < LEAST_HEIGHT else int(np.sign(off))
-    return BasedFace(surface, field, region, facing, samples, areas, variances)
+    return BasedFace(surface, field, region, _facing(surface, field.base, samples), samples, areas, variances)
+
+
+def _facing(surface: BSplineSurface, base: Base, samples: Array) -> int:
+    """As in BasedFace; by the centre of the data set where the surface does not tell it.
+
+    Passing a corner, a robot sees walls round it from one end of its way, whose middle lies behind them.
+    """
+    if surface.side:
+        return surface.side * base_side(surface, base)
+    off = float(base.local(sensor_position(surface))[2] - base.local(samples)[:, 2].mean())
+    return 0 if abs(off) < LEAST_HEIGHT else int(np.sign(off))
+
+
+def base_side(surface: Surface, base: Base) -> int:
+    """+1 where S_u x S_v of a surface points along the normal of its base, else -1."""
+    return side_towards(surface, MIDDLE, normals(base, evaluate_surface(surface, *MIDDLE.T)))
 
 
 def _in_line(places: Array, step: float) -> bool:

@@ -87,6 +87,7 @@ def _samples(surface: BSplineSurface) -> tuple[Array, Array]:
     points, Su, Sv = evaluate_surface(surface, at[:, 0], at[:, 1], 1)
     normals = np.cross(Su, Sv)
     size = np.linalg.norm(normals, axis=1)
-    sides = np.sign(np.sum((sensor_position(surface) - points) * normals, axis=1))
+    by_centre = np.sign(np.sum((sensor_position(surface) - points) * normals, axis=1))
+    sides = np.full(len(points), float(surface.side)) if surface.side else by_centre
     good = (size > 0.0) & (sides != 0.0)
     return points[good], (sides[good] / size[good])[:, None] * normals[good]

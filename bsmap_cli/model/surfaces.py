@@ -134,6 +134,7 @@ class BSplineSurface:
     name : of the surface, unique in its map.  data_sets : it was fitted to.
     trims : what of it was seen: the points around which the loops together wind counter-clockwise, holes being run
     around clockwise. Loops may overlap. Without trims it is the whole surface.
+    side : +1 where S_u x S_v points to the sensor that saw it, -1 where it points away, 0 where that is not known.
     """
 
     name: str
@@ -146,6 +147,7 @@ class BSplineSurface:
     covariance: SurfaceCovariance | HeightCovariance
     residuals: Residuals
     trims: tuple[TrimLoop, ...] = ()
+    side: int = 0
 
     def __post_init__(self) -> None:
         nu, nv = len(self.knots_u) - self.degree_u - 1, len(self.knots_v) - self.degree_v - 1

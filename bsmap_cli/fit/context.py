@@ -4,10 +4,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.blocks import Blocks, make_blocks
-from bsmap_cli.fit.lowmodels import Sums, chi_squares
+from bsmap_cli.fit.lowmodels import GRAZING, Sums, chi_squares
 from bsmap_cli.fit.pieces import Pieces
 from bsmap_cli.model import Array, IntArray
 
@@ -17,6 +18,8 @@ SLACK = 0.05
 """Chi square a beam that a joint surface may be worse, for noise is not quite white."""
 FLATNESS = 0.004
 """Metres by which a real wall may leave a polynomial without being two."""
+JUMP = 10.0
+"""Standard deviations that a jump is longer than the steps of a surface that beams graze."""
 LEAST_OVERLAP = 0.3
 """Share of the shorter of two pieces of neighbouring scans that lies before beams of the other."""
 
@@ -26,7 +29,8 @@ class Context(NamedTuple):
 
     blocks : of all pieces, in their order.  first : (k + 1,) first block of each piece.
     chi : (k,) chi square of each piece about its own line.  price : (k,) of its parameters.  beams : (k,) its returns.
-    neighbours : of each piece, those one or two scans away before the same beams.
+    neighbours : of each piece, those one or two scans away before the same beams.  parted : of each, those of them from
+    which a jump parts it; they are not among its neighbours.
     sigma : metres, noise along the beam that block means show, in terms of single beams.
     """
 
@@ -37,6 +41,7 @@ class Context(NamedTuple):
     price: Array
     beams: Array
     neighbours: list[list[int]]
+    parted: list[list[int]]
     sigma: float
 
     @property
@@ -58,9 +63,8 @@ def make_context(grid: BeamGrid, pieces: Pieces) -> Context:
     chi = _own_chi(blocks, size, grid.sigma)
     count = np.bincount(blocks.owner, blocks.counts, len(pieces.row)).astype(np.float64)
     inflation = _inflation(chi, np.diff(first) - size)
-    return Context(
-        pieces, blocks, first, chi / inflation, price, count, _neighbours(pieces), grid.sigma * np.sqrt(inflation)
-    )
+    sigma = grid.sigma * np.sqrt(inflation)
+    return Context(pieces, blocks, first, chi / inflation, price, count, *_neighbours(grid, pieces), sigma)
 
 
 def _inflation(chi: Array, freedom: IntArray) -> float:
@@ -100,22 +104,56 @@ def _own_chi(blocks: Blocks, size: IntArray, sigma: float) -> Array:
     return out
 
 
-def _neighbours(pieces: Pieces) -> list[list[int]]:
-    """For each piece those one or two scans away whose beams overlap its own."""
-    out: list[list[int]] = [[] for _ in pieces.row]
+def _neighbours(grid: BeamGrid, pieces: Pieces) -> tuple[list[list[int]], list[list[int]]]:
+    """For each piece those one or two scans away whose beams overlap its own and that no jump parts from it; and those
+    that one does, before or behind it in its own scan, too.
+    """
+    near: list[list[int]] = [[] for _ in pieces.row]
+    parted: list[list[int]] = [[] for _ in pieces.row]
+    pairs, beams = _overlapping(pieces)
+    jumps = _parted(grid, pieces, pairs, np.column_stack([beams, beams]))
+    following = np.flatnonzero(pieces.row[1:] == pieces.row[:-1])
+    beside = np.column_stack([following, following + 1])
+    ends = np.column_stack([pieces.stop[following] - 1, pieces.start[following + 1]])
+    for lists, some in (
+        (near, pairs[~jumps]),
+        (parted, pairs[jumps]),
+        (parted, beside[_parted(grid, pieces, beside, ends)]),
+    ):
+        for one, other in some.tolist():
+            lists[one].append(other)
+            lists[other].append(one)
+    return near, parted
+
+
+def _overlapping(pieces: Pieces) -> tuple[IntArray, IntArray]:
+    """Pairs (n, 2) of pieces one or two scans apart before about the same beams, and the middle one (n,) of these."""
+    pairs, beams = [np.zeros((0, 2), dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
     rows = int(pieces.row.max(initial=-1)) + 1
     bounds = np.searchsorted(pieces.row, np.arange(rows + 1))
     for step in (1, 2):
         for row in range(rows - step):
             a, b = (np.arange(bounds[r], bounds[r + 1]) for r in (row, row + step))
-            common = np.minimum(pieces.stop[a][:, None], pieces.stop[b]) - np.maximum(
-                pieces.start[a][:, None], pieces.start[b]
-            )
+            first = np.maximum(pieces.start[a][:, None], pieces.start[b])
+            common = np.minimum(pieces.stop[a][:, None], pieces.stop[b]) - first
             shorter = np.minimum((pieces.stop - pieces.start)[a][:, None], (pieces.stop - pieces.start)[b])
-            for i, j in np.argwhere(common >= np.maximum(2, LEAST_OVERLAP * shorter)):
-                out[a[i]].append(int(b[j]))
-                out[b[j]].append(int(a[i]))
-    return out
+            i, j = np.nonzero(common >= np.maximum(2, LEAST_OVERLAP * shorter))
+            pairs.append(np.column_stack([a[i], b[j]]))
+            beams.append(first[i, j] + common[i, j] // 2)
+    return np.concatenate(pairs), np.concatenate(beams)
+
+
+def _parted(grid: BeamGrid, pieces: Pieces, pairs: IntArray, beams: IntArray) -> NDArray[np.bool_]:
+    """(n,) whether the ends of two beams (n, 2), one of each piece of pairs (n, 2), are so far apart along the beam
+    that a surface through both would graze it: one of the pieces stands before the other.
+    """
+    rows = pieces.row[pairs]
+    one, other = (grid.points[rows[:, k], beams[:, k]] for k in (0, 1))
+    ways = grid.directions[rows[:, 0], beams[:, 0]]
+    between = other - one
+    along = np.sum(between * ways, axis=1)
+    across = np.linalg.norm(between - along[:, None] * ways, axis=1)
+    return np.asarray(np.abs(along) > across / GRAZING + JUMP * grid.sigma, dtype=bool)
 
 
 def joint_excess(context: Context, members: list[int], sums: Sums, size: int) -> float:

@@ -14,7 +14,17 @@ from bsmap_cli.fit.blocks import Blocks, make_blocks, single_beams, thinned
 from bsmap_cli.fit.clutter import find_planes
 from bsmap_cli.fit.crossings import find_crossings
 from bsmap_cli.fit.grazing import without_grazed_ends
-from bsmap_cli.fit.heights import Base, Bulge, CylinderBase, HeightField, PlaneBase, evaluate, plane_base
+from bsmap_cli.fit.heights import (
+    Base,
+    Bulge,
+    CylinderBase,
+    HeightField,
+    PlaneBase,
+    evaluate,
+    flat_knots,
+    offset,
+    plane_base,
+)
 from bsmap_cli.fit.labels import (
     Runs,
     adopt,
@@ -27,7 +37,7 @@ from bsmap_cli.fit.lowmodels import CylinderFrame, fit_cylinder_frame, fit_plane
 from bsmap_cli.fit.misses import find_misses, without_alike, without_outliers, without_slipped_ends
 from bsmap_cli.fit.pieces import find_pieces
 from bsmap_cli.fit.regions import find_regions
-from bsmap_cli.fit.seeds import PAIR_BEAMS
+from bsmap_cli.fit.seeds import PAIR_BEAMS, SEED_INCIDENCE
 from bsmap_cli.fit.selection import LEAST_BLOCKS, Fitted, fit_heights, refit
 from bsmap_cli.fit.sides import closed_at_creases, on_their_sides
 from bsmap_cli.fit.unions import low_order_cost
@@ -39,6 +49,8 @@ FARTHEST = 1.0
 """Metres by which a face's rectangle may grow towards its creases."""
 STEEPEST_HEIGHTS = 3.0
 """Slope of the heights of a face over its base, 72 degrees."""
+ASTRAY = 0.05
+"""Share of its beams that may seem to meet a face from behind."""
 LITTLE = 0.05
 """Share of its beams in which a face has hardly changed."""
 CLOSE = 0.01
@@ -96,14 +108,18 @@ def find_faces(grid: BeamGrid) -> Faces:
             fitted = _refit_all(grid, labels, [fields[k] for k in kept], noise)
     misses = find_misses(grid, labels, [f.field for f in fitted], before=misses)
     labels, kept = _kept(fill(grid, believed(grid, misses, sigma, noise)), grid)
+    if not len(kept):
+        return Faces(labels, [], noise)
     fitted = _widened(grid, labels, [fitted[k] for k in kept], noise)
     # Planes lie as before; what is bent was fitted anew to single beams, on other knots.
     bent = np.append([f.field.knots.size > 4 for f in fitted], False).astype(bool)
     misses = find_misses(grid, np.where(bent[labels], labels, -1), [f.field for f in fitted], before=misses)
     labels = fill(grid, np.where(bent[labels], believed(grid, misses, sigma, noise), labels))
     for number, one in enumerate(fitted):
-        points = grid.points[(labels == number) & grid.hit]
-        if len(points) < LEAST_BLOCKS * one.field.knots.size or _stands_on_edge(one.field, points):
+        beams = (labels == number) & grid.hit
+        points, directions = grid.points[beams], grid.directions[beams]
+        few = len(points) < LEAST_BLOCKS * one.field.knots.size
+        if few or _stands_on_edge(one.field, points) or _seen_from_both_sides(one.field, points, directions):
             labels[labels == number] = -1
     fields = [one.field for one in fitted]
     labels = on_their_sides(grid, labels, fields, sigma)
@@ -145,6 +161,18 @@ def _stands_on_edge(field: HeightField, points: Array) -> bool:
     """Whether a field is far too steep over its base at the beams' ends (n, 3): beams in one line tell no plane."""
     gradient = evaluate(field, field.parameters(field.base.local(points)))[1]
     return bool(np.median(np.sum(gradient**2, axis=1)) > STEEPEST_HEIGHTS**2)
+
+
+def _seen_from_both_sides(field: HeightField, points: Array, directions: Array) -> bool:
+    """Whether beams (n, 3) that end at points (n, 3) meet a field from either side, those that graze it aside.
+
+    A cylinder can be laid through somebody near by, seen from outside, and a wall far behind, from inside.
+    """
+    if isinstance(field.base, PlaneBase) and field.knots.size == flat_knots().size:
+        return False  # a plane has all of them on one side
+    sine = np.sum(offset(field, points)[1] * directions, axis=1)
+    behind, before = (np.count_nonzero(side * sine > SEED_INCIDENCE) for side in (1.0, -1.0))
+    return bool(min(behind, before) > ASTRAY * (behind + before))
 
 
 def _renumber(labels: IntArray, grid: BeamGrid) -> IntArray:

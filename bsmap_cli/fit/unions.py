@@ -43,8 +43,7 @@ class _Region(NamedTuple):
     sums: Sums
     cost: float
     box: Array
-    round: bool
-    bent: bool
+    low: "LowOrder"
 
 
 def unite_regions(context: Context, regions: list[list[int]]) -> list[list[int]]:
@@ -74,7 +73,7 @@ def _region(context: Context, members: Sequence[int]) -> _Region:
     box = np.array([blocks.points.min(axis=0), blocks.points.max(axis=0)])
     sums = sums_of(frame, blocks, context.sigma)
     low = _low_order_cost(blocks, sums, context.sigma)
-    return _Region(tuple(members), blocks, frame, sums, low.cost, box, low.is_round, low.bent)
+    return _Region(tuple(members), blocks, frame, sums, low.cost, box, low)
 
 
 class LowOrder(NamedTuple):
@@ -145,8 +144,10 @@ def _joined(context: Context, a: _Region, b: _Region) -> _Region | None:
     apart = np.maximum(a.box[0], b.box[0]) - np.minimum(a.box[1], b.box[1])
     if np.linalg.norm(np.maximum(apart, 0.0)) > NEAR:
         return None
-    vaulted = a.bent and b.bent and min(len(a.blocks.counts), len(b.blocks.counts)) >= VAULT // 4
-    curved = a.round or b.round or vaulted
+    if _one_before_the_other(context, a, b):
+        return None
+    vaulted = a.low.bent and b.low.bent and min(len(a.blocks.counts), len(b.blocks.counts)) >= VAULT // 4
+    curved = a.low.is_round or b.low.is_round or vaulted
     if not curved and abs(a.frame.axes[:, 2] @ b.frame.axes[:, 2]) < 0.7 and len(b.members) > 1:
         return None
     height = (b.blocks.points - a.frame.origin) @ a.frame.axes[:, 2]
@@ -157,12 +158,21 @@ def _joined(context: Context, a: _Region, b: _Region) -> _Region | None:
     if not curved and _far_from_one(context, a, b, limit):
         return None
     joint = _region(context, a.members + b.members)
-    return joint if _same_side(joint) and joint.cost < limit else None
+    return joint if joint.cost < limit and _same_side(joint) else None
+
+
+def _one_before_the_other(context: Context, a: _Region, b: _Region) -> bool:
+    """Whether a jump in front of the same beams parts two regions: no smooth surface that they could see goes on there.
+
+    A polynomial or a cylinder can be laid through somebody near by and the wall behind, with nothing between the two.
+    """
+    members = set(b.members)
+    return any(k in members for member in a.members for k in context.parted[member])
 
 
 def _far_from_one(context: Context, a: _Region, b: _Region, limit: float) -> bool:
     """Whether a flat region would have to give up far too much for another: told over its own frame, at little cost."""
-    if a.bent or len(a.blocks.counts) < VAULT // 4:
+    if a.low.bent or len(a.blocks.counts) < VAULT // 4:
         return False
     rows = len(np.union1d(a.blocks.row, b.blocks.row))
     joint = a.sums.plus(sums_of(a.frame, b.blocks, context.sigma))
@@ -170,9 +180,27 @@ def _far_from_one(context: Context, a: _Region, b: _Region, limit: float) -> boo
 
 
 def _same_side(region: _Region) -> bool:
-    """Whether the sensor saw all of a region from one side of its plane (the two faces of a thin wall are two)."""
-    if region.round:
-        return True
-    towards = region.blocks.directions @ region.frame.axes[:, 2]
-    share = float(np.average(towards > 0.0, weights=region.blocks.counts))
+    """Whether the sensor saw all of a region from one side (the two faces of a thin wall are two).
+
+    A circle or a sphere can be laid through somebody near by, seen from outside, and a wall far behind, from inside.
+    """
+    if region.low.is_round:
+        sine = np.sum(region.blocks.directions * _outwards(region), axis=1)
+        weights = region.blocks.counts * np.abs(sine)
+    else:
+        sine, weights = region.blocks.directions @ region.frame.axes[:, 2], region.blocks.counts
+    share = float(np.average(sine > 0.0, weights=weights))
     return min(share, 1.0 - share) < 0.05
+
+
+def _outwards(region: _Region) -> Array:
+    """(n, 3) unit vectors at the blocks of a round region away from its axis, or from the middle of its sphere."""
+    low, blocks = region.low, turned(region.blocks, region.low.axes)
+    if low.sphere is not None:
+        away = region.blocks.points - low.sphere.centre
+    else:
+        found = fit_cylinder_frame(_some(blocks))
+        assert found is not None  # by which it is round
+        away = np.column_stack([blocks.points[:, :2] - found.centre, np.zeros(len(blocks.points))])
+        away = away if low.axes is None else away @ low.axes.T
+    return np.asarray(away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9))

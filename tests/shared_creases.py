@@ -55,6 +55,11 @@ class Borders:
             out.append(before[out[-1]])
         return np.array(out[::-1])
 
+    def runs_along(self, chain):
+        """Whether the border has the edges from each vertex (k, 3) of a chain to the next, among others."""
+        places = [tuple(place) for place in chain.tolist()]
+        return all(b in self.next.get(a, ()) for a, b in zip(places[:-1], places[1:], strict=True))
+
     @staticmethod
     def _beside(point, start, end):
         return distance_to_lines(np.array([point]), [np.array([start, end])])[0] < FARTHEST
@@ -73,7 +78,7 @@ def seams(creases, meshes):
             sides += 1
             one, other = (border.chain(start, end) for border in both)
             if one is not None and other is not None:
-                if not np.array_equal(one, other):
+                if not both[1].runs_along(one) and not both[0].runs_along(other):
                     gaps.append(max(distance_to_lines(one, [other]).max(), distance_to_lines(other, [one]).max()))
             else:
                 line = np.linspace(start, end, 9)

@@ -14,6 +14,7 @@ from bsmap_cli.export.tessellation import tessellate_map
 from bsmap_cli.fit.heights import evaluate
 from bsmap_cli.merge import merge_surfaces
 from bsmap_cli.merge.bases import based_face, field_of
+from bsmap_cli.merge.shapes import parameters_along, parameters_of, spline_shape
 from bsmap_cli.model import Crease, TrimLoop
 from bsmap_cli.params import MergeParams
 
@@ -112,6 +113,22 @@ def test_field_over_a_cylinder_is_that_of_its_surface():
     uv = np.random.default_rng(0).uniform(size=(200, 2))
     local = field.base.local(evaluate_surface(surface, *uv.T))
     assert np.abs(local[:, 2] - evaluate(field, field.parameters(local))[0]).max() < 2e-4
+
+
+@pytest.mark.parametrize("end", [0.0, 1.0])
+def test_corners_where_a_round_face_begins_again_lie_at_the_end_on_which_their_outline_is(end):
+    shape = spline_shape(arc("a/1", 1.0, 0.001 - np.pi, np.pi - 0.001, sensor=INSIDE))
+    away = np.array([0.0, 0.02, 0.4, 0.4, 0.02, 0.0])
+    uv = np.column_stack([np.abs(end - away), [0.2, 0.2, 0.2, 0.8, 0.8, 0.8]])
+    other = uv.copy()
+    other[[0, -1], 0] = 1.0 - end
+    for placed in (uv, other):
+        points = evaluate_surface(shape.surface, *placed.T)
+        np.testing.assert_allclose(parameters_of(shape, points), placed, atol=1e-6)
+        np.testing.assert_allclose(parameters_along(shape, points), uv, atol=1e-3)
+    open_one = spline_shape(arc("a/1", 1.0, -2.0, 2.0, sensor=INSIDE))
+    points = evaluate_surface(open_one.surface, *other.T)
+    np.testing.assert_array_equal(parameters_along(open_one, points), parameters_of(open_one, points))
 
 
 @pytest.mark.parametrize("bow", [0.0, 0.03, 0.08])

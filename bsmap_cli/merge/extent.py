@@ -8,7 +8,7 @@ import numpy as np
 from bsmap_cli.core.bspline import clamped_knots, design_matrix, inner_knots
 from bsmap_cli.fit.heights import HeightField, greville
 from bsmap_cli.merge.regions import GRID
-from bsmap_cli.merge.shapes import Shape, parameters_of
+from bsmap_cli.merge.shapes import Shape, parameters_along
 from bsmap_cli.merge.topology import Ring
 from bsmap_cli.model import Array, BSplineSurface, HeightCovariance, TrimLoop
 
@@ -18,7 +18,7 @@ def trimmed(surface: BSplineSurface, rings: Sequence[Ring], shape: Shape) -> BSp
 
     shape : that of the surface.
     """
-    found = [parameters_of(shape, ring.points) for ring in rings]
+    found = [parameters_along(shape, ring.points) for ring in rings]
     low, high = np.zeros(2), np.ones(2)
     if isinstance(shape, HeightField):
         lowest, highest = (f([f(uv, axis=0) for uv in found], axis=0) for f in (np.min, np.max))

@@ -7,7 +7,7 @@ import numpy as np
 
 from bsmap_cli.core.polygons import simplify
 from bsmap_cli.merge.rings import Ring
-from bsmap_cli.merge.shapes import Shape, flattened
+from bsmap_cli.merge.shapes import Shape, flattened_ring
 from bsmap_cli.model import Array, IntArray
 
 TOLERANCE = 0.01
@@ -16,7 +16,7 @@ TOLERANCE = 0.01
 
 def fewer_vertices(rings: Sequence[Ring], shape: Shape) -> list[Ring]:
     """Rings of a face, the vertices of their open borders thinned out; those that creases hold stay."""
-    return [_fewer(ring, flattened(shape, ring.points)) for ring in rings]
+    return [_fewer(ring, flattened_ring(shape, ring.points)) for ring in rings]
 
 
 def _fewer(ring: Ring, flat: Array) -> Ring:

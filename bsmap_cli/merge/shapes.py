@@ -14,6 +14,8 @@ from bsmap_cli.model import Array, BSplineSurface
 GRID = 40
 """Samples along u and along v from which the nearest parameters are searched."""
 STEPS = 8
+CLOSED = 0.01
+"""Metres between the first and the last line of a surface that goes all around, at most."""
 SETTLED = 1e-12
 """Squared change of the parameters below which a step is the last one."""
 
@@ -55,6 +57,39 @@ def placed(shape: Shape, flat: Array) -> Array:
     if isinstance(shape, HeightField):
         return places_on(shape, (flat - shape.low) / (shape.high - shape.low))
     return evaluate_surface(shape.surface, *np.clip(flat / lengths_of(shape), 0.0, 1.0).T)
+
+
+def parameters_along(shape: Shape, ring: Array) -> Array:
+    """(n, 2) parameters of a closed line (n, 3) on a surface; where that closes on itself, at the end on which the line
+    comes and goes.
+
+    A corner at which u begins again lies at both of its ends: which is nearer is chance.
+    """
+    uv = parameters_of(shape, ring)
+    if isinstance(shape, HeightField) or not _closes(shape):
+        return uv
+    slit = CLOSED / lengths_of(shape)[0]
+    off = np.flatnonzero((uv[:, 0] > slit) & (uv[:, 0] < 1.0 - slit))
+    if len(off):
+        number = np.searchsorted(off, np.arange(len(uv)))
+        ends = np.rint(uv[off, 0])
+        before, behind = ends[number - 1], ends[number % len(off)]
+        beside = np.abs(uv[:, 0] - before) > 1.0 - slit
+        uv[(before == behind) & beside, 0] = before[(before == behind) & beside]
+    return uv
+
+
+def flattened_ring(shape: Shape, ring: Array) -> Array:
+    """(n, 2) parameters along a closed line (n, 3) on a surface, in about metres."""
+    if isinstance(shape, HeightField):
+        return flattened(shape, ring)
+    return parameters_along(shape, ring) * lengths_of(shape)
+
+
+def _closes(shape: SplineShape) -> bool:
+    """Whether a surface goes all around, and u begins where it ends."""
+    grid = shape.points.reshape(GRID, GRID, 3)
+    return bool(np.linalg.norm(grid[0] - grid[-1], axis=1).max() < CLOSED)
 
 
 def lengths_of(shape: SplineShape) -> Array:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from bsmap_cli.core.polygons import signed_area
 from bsmap_cli.merge.rings import Ring
-from bsmap_cli.merge.shapes import Shape, flattened
+from bsmap_cli.merge.shapes import Shape, flattened_ring
 from bsmap_cli.model import Array, IntArray
 
 THIN = 0.005
@@ -19,8 +19,8 @@ MOST = 50
 
 def untangled(rings: Sequence[Ring], shape: Shape) -> list[Ring]:
     """Rings of a face that neither double back nor cross, as far as vertices that no crease holds make them so."""
-    out = [_without_spikes(ring, flattened(shape, ring.points)) for ring in rings]
-    flat = [flattened(shape, ring.points) for ring in out]
+    out = [_without_spikes(ring, flattened_ring(shape, ring.points)) for ring in rings]
+    flat = [flattened_ring(shape, ring.points) for ring in out]
     for _ in range(MOST):
         crossings = _crossings(flat)
         better = _without_crossing(out, flat, crossings) if len(crossings) else None

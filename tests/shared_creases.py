@@ -4,6 +4,7 @@ A crease is a chain of points. Between two of them that follow each other the bo
 edges, too, and that of the other face must be the same to the last bit.
 """
 
+import itertools
 from collections import defaultdict, deque
 from typing import NamedTuple
 
@@ -58,7 +59,7 @@ class Borders:
     def runs_along(self, chain):
         """Whether the border has the edges from each vertex (k, 3) of a chain to the next, among others."""
         places = [tuple(place) for place in chain.tolist()]
-        return all(b in self.next.get(a, ()) for a, b in zip(places[:-1], places[1:], strict=True))
+        return all(b in self.next.get(a, ()) for a, b in itertools.pairwise(places))
 
     @staticmethod
     def _beside(point, start, end):

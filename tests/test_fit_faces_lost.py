@@ -1,6 +1,7 @@
 """Beams that were lost: what lies between many neighbours of one face is no hole, a window is."""
 
 import numpy as np
+import pytest
 
 from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.division import find_faces
@@ -57,3 +58,11 @@ def test_as_many_are_filled_as_told_where_both_scans_beside_show_the_face():
     np.testing.assert_array_equal(enclosed(grid, labels, 7), labels)
     labels[3, 12] = 1  # another face behind one of them
     assert (enclosed(grid, labels, 8)[2, 10:18] == -1).all()
+
+
+@pytest.mark.parametrize("share", [0.02, 0.1])
+def test_beams_too_few_for_any_face_are_the_rest(share):
+    grid = wall(np.random.default_rng(0).uniform(size=SHAPE) < share)
+    faces = find_faces(grid)
+    assert not faces.fitted
+    assert np.all(faces.labels == -1)

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from face_maps import map_of, wall
 
+from bsmap_cli.core.bspline import evaluate_surface
 from bsmap_cli.core.trims import rims_of
 from bsmap_cli.evaluate import surface_samples
 from bsmap_cli.io.surfaces_json import read_surfaces, write_surfaces
 from bsmap_cli.merge import merge_surfaces
+from bsmap_cli.model import TrimLoop
 from bsmap_cli.params import MergeParams
 
 PLACES = np.array([1.98, 2.01, 1.99, 2.02, 2.0])
@@ -47,6 +49,21 @@ def test_a_rim_runs_in_the_middle_of_the_brackets():
     np.testing.assert_allclose(np.sort(rim.points[:, 2]), [0.0, 2.5], atol=1e-5)
     assert rim.width == pytest.approx(0.04)
     assert surface_samples(result, 0.1)[:, 0].max() < 2.006
+
+
+def test_a_notch_that_all_leave_open_is_no_rim():
+    # 35 mm deep and 7 cm high: its sides stay near the rim, but no data set tells of an edge that goes their way.
+    corners = np.array([[0, 0], [1, 0], [1, 0.486], [0.9825, 0.5], [1, 0.514], [1, 1], [0, 1]])
+    rims = np.array([0, 0.04, 0, 0, 0.04, 0, 0])
+    walls = [wall(f"set-{k}/1", 0.0, 2.0) for k in range(3)]
+    result = merged(*(replace(w, trims=(TrimLoop(corners, np.full(7, -1), rims),)) for w in walls))
+    (surface,) = result.surfaces
+    points = np.concatenate([rim.points for rim in rims_of(surface)])
+    np.testing.assert_allclose(points[:, 0], 2.0, atol=0.005)
+    assert np.ptp(points[:, 2]) == pytest.approx(2.5, abs=1e-3)
+    assert not np.any(np.abs(points[:, 2] - 1.25) < 0.02)
+    corner = evaluate_surface(surface, *surface.trims[0].parameters.T)
+    assert np.linalg.norm(corner[:, [0, 2]] - [1.965, 1.25], axis=1).min() < 0.02
 
 
 def test_the_order_of_the_input_does_not_matter():

@@ -122,12 +122,11 @@ def _led_along(ring: Ring, flat: Array, seen: _Seen, shape: Shape) -> Ring:
     for a, b in pairwise([0, *(np.flatnonzero(np.diff(follows)) + 1).tolist(), len(follows)]):
         border = flat[a : b + 1]
         if follows[a] and np.linalg.norm(np.diff(border, axis=0), axis=1).sum() >= LEAST:
-            rim, width = _rim(border, seen)
-            rim_points = _held(placed(shape, rim), points[[a, b]], held[[a, b % len(held)]])
+            rim, widths = _rim(border, seen)
+            rim_points, widths = _held(placed(shape, rim), widths, points[[a, b]], held[[a, b % len(held)]])
             # Where a rim ends, the next side begins.
             points[b] = rim_points[-1]
-            n = len(rim_points) - 1
-            parts.append(Ring(rim_points[:-1], np.full(n, -1), np.full(n, width)))
+            parts.append(Ring(rim_points[:-1], np.full(len(widths), -1), widths))
         else:
             parts.append(Ring(points[a:b].copy(), edges[a:b], np.zeros(b - a)))
     return Ring(*(np.concatenate(of) for of in zip(*parts, strict=True)))
@@ -162,14 +161,14 @@ def _follow(flat: Array, edges: IntArray, seen: _Seen) -> NDArray[np.bool_]:
     return follows
 
 
-def _rim(border: Array, seen: _Seen) -> tuple[Array, float]:
-    """Vertices (j, 2) of the rim along a border (k, 2), and metres of the brackets."""
+def _rim(border: Array, seen: _Seen) -> tuple[Array, Array]:
+    """Vertices (j, 2) of the rim along a border (k, 2), and metres (j - 1,) of brackets; 0 where none goes along."""
     bounds = _bends(border, 0, len(border) - 1, seen)
     lines, brackets = zip(*(_through(border[a : b + 1], seen) for a, b in pairwise(bounds)), strict=True)
     joints = (_joint(lines[k], lines[k + 1], border[at]) for k, at in enumerate(bounds[1:-1]))
     out = np.array([lines[0].foot(border[0]), *joints, lines[-1].foot(border[-1])])
-    widths = np.concatenate(brackets)
-    return out, float(np.median(widths)) if len(widths) else 0.0
+    known = np.array([len(widths) > 0 for widths in brackets])
+    return out, known * (float(np.median(np.concatenate(brackets))) if known.any() else 0.0)
 
 
 def _bends(border: Array, first: int, last: int, seen: _Seen) -> list[int]:
@@ -225,8 +224,11 @@ def _joint(one: _Line, other: _Line, place: Array) -> Array:
     return crossing if np.linalg.norm(crossing - place) < NEAR + OFF else halfway
 
 
-def _held(rim: Array, ends: Array, held: NDArray[np.bool_]) -> Array:
-    """The rim (j, 3), begun and ended at the ends (2, 3) of the border where creases hold them."""
+def _held(rim: Array, widths: Array, ends: Array, held: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """The rim (j, 3) and its widths (j - 1,), begun and ended at the ends (2, 3) of the border where creases hold them.
+
+    The way from such an end to a rim that lies aside follows nothing.
+    """
     for side in (0, -1):
         if held[side]:
             end = ends[side]
@@ -234,4 +236,5 @@ def _held(rim: Array, ends: Array, held: NDArray[np.bool_]) -> Array:
                 rim[side] = end
             else:
                 rim = np.concatenate([end[None], rim] if side == 0 else [rim, end[None]])
-    return rim
+                widths = np.append(0.0, widths) if side == 0 else np.append(widths, 0.0)
+    return rim, widths

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from bsmap_cli.core.polygons import signed_area
 from bsmap_cli.merge.outlines import Member
 from bsmap_cli.merge.rings import Ring
-from bsmap_cli.merge.shapes import Shape, flattened, placed
+from bsmap_cli.merge.shapes import Shape, flattened_ring, placed
 from bsmap_cli.model import Array, IntArray
 
 FINE = 0.02
@@ -68,7 +68,7 @@ def along_rims(rings: Sequence[Ring], members: Iterable[Member], shape: Shape) -
     seen = _seen(members, shape)
     if seen is None:
         return list(rings)
-    flat = [flattened(shape, ring.points) for ring in rings]
+    flat = [flattened_ring(shape, ring.points) for ring in rings]
     if _clockwise(flat):
         seen = seen._replace(ways=-seen.ways)
     return [_led(ring, places, seen, shape) for ring, places in zip(rings, flat, strict=True)]
@@ -84,7 +84,7 @@ def _seen(members: Iterable[Member], shape: Shape) -> _Seen | None:
     sides, widths = [np.zeros((0, 2, 2))], [np.zeros(0)]
     for member in members:
         if any(rims.any() for rims in member.rims):
-            flat = [flattened(shape, corners) for corners in member.corners]
+            flat = [flattened_ring(shape, corners) for corners in member.corners]
             ends = np.concatenate([np.stack([loop, np.roll(loop, -1, axis=0)], axis=1) for loop in flat])
             rims = np.concatenate(member.rims)
             sides.append(ends[rims > 0.0][:, :: -1 if _clockwise(flat) else 1])

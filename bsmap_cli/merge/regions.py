@@ -47,6 +47,8 @@ def united(regions: Sequence[Region], gap: float, creases: Array = NO_SIDES) -> 
     if gap > 0.0 and len(regions) > 1:
         grown = shapely.buffer(whole, gap / 2.0, join_style="mitre", mitre_limit=2.0)
         closed = shapely.buffer(grown, -gap / 2.0 - GRID, join_style="mitre", mitre_limit=2.0)
+        # Mitres of a ragged outline may cross.
+        closed = shapely.make_valid(closed, method="structure", keep_collapsed=False)
         holes = shapely.union_all([shapely.difference(filled(region), region) for region in regions])
         added = shapely.difference(shapely.difference(closed, whole), holes)
         lines = shapely.STRtree(list(shapely.linestrings(creases)))

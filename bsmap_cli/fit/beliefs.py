@@ -47,12 +47,11 @@ def believed(grid: BeamGrid, misses: Misses, sigma: float, noise: float) -> IntA
     them as noise and unevenness would have it.
     """
     labels = without_outliers(misses, sigma)
-    of_faces = misses.labels[member := (misses.labels >= 0) & grid.hit]
-    before = np.bincount(of_faces)
-    near = np.abs(misses.beyond) < OUTLIER * noise
-    count = np.bincount(misses.labels[near & member], minlength=len(before))
-    some = np.maximum(count, 1)
-    square = np.bincount(misses.labels[near & member], misses.beyond[near & member] ** 2, len(before)) / some
+    member = (misses.labels >= 0) & grid.hit
+    before = np.bincount(misses.labels[member])
+    near = member & (np.abs(misses.beyond) < OUTLIER * noise)
+    some = np.maximum(np.bincount(misses.labels[near], minlength=len(before)), 1)
+    square = np.bincount(misses.labels[near], misses.beyond[near] ** 2, len(before)) / some
     most = NOISY**2 * (noise**2 + FLATNESS**2) * (1.0 + SURE * np.sqrt(2.0 / some))
     after = np.bincount(labels[(labels >= 0) & grid.hit], minlength=len(before))
     denied = np.append((after < KEPT * before) | (square > most), False)

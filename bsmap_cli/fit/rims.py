@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bsmap_cli.core.lines import straight_line
 from bsmap_cli.core.polygons import simplify
 from bsmap_cli.fit.beams import BeamGrid
 from bsmap_cli.fit.crossings import Crossings
@@ -124,16 +125,10 @@ def _leads_on(grid: BeamGrid, chain: list[IntArray], beyond: Array) -> NDArray[n
 def straightened(points: Array, widths: Array) -> Array:
     """A rim (k, 2) with fewer vertices (j, 2): straight lines that keep about within half the brackets (k,)."""
     kept = np.flatnonzero(simplify(points, min(LED, 0.5 * float(np.median(widths)))))
-    lines = [_line(points[first : last + 1]) for first, last in itertools.pairwise(kept.tolist())]
+    lines = [straight_line(points[first : last + 1]) for first, last in itertools.pairwise(kept.tolist())]
     starts, ends = (
         [middle + ((points[k] - middle) @ way) * way for (middle, way), k in zip(lines, at.tolist(), strict=True)]
         for at in (kept[:-1], kept[1:])
     )
     inner = [(end + start) / 2.0 for end, start in zip(ends[:-1], starts[1:], strict=True)]
     return np.array([starts[0], *inner, ends[-1]])
-
-
-def _line(points: Array) -> tuple[Array, Array]:
-    """A point of the straight line through points (k, d), and its direction (d,)."""
-    middle = np.mean(points, axis=0)
-    return middle, np.linalg.svd(points - middle, full_matrices=False)[2][0]

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from bsmap_cli.core.lines import straight_line
 from bsmap_cli.core.polygons import signed_area
 from bsmap_cli.merge.outlines import Member
 from bsmap_cli.merge.rings import Ring
@@ -202,16 +203,11 @@ def _middle_line(places: Array, widths: Array, way: Array) -> _Line:
     little.
     """
     weights = 1.0 / widths**2
-    line = _line(places, weights)
+    line = _Line(*straight_line(places, weights))
     for _ in range(ROUNDS):
-        line = _line(places, weights / np.maximum(np.abs(line.right(places)) / widths, LEAST_OFF))
+        off = np.maximum(np.abs(line.right(places)) / widths, LEAST_OFF)
+        line = _Line(*straight_line(places, weights / off))
     return line if line.way @ way >= 0.0 else _Line(line.middle, -line.way)
-
-
-def _line(places: Array, weights: Array) -> _Line:
-    """The straight line through places (k, 2) with weights (k,)."""
-    middle = np.average(places, axis=0, weights=weights)
-    return _Line(middle, np.linalg.svd((places - middle) * np.sqrt(weights)[:, None], full_matrices=False)[2][0])
 
 
 def _joint(one: _Line, other: _Line, place: Array) -> Array:

@@ -58,8 +58,8 @@ class Closures(NamedTuple):
 def close_loops(tracking: Tracking, range_sigma: float, track: Track) -> Closures:
     """Find loops, smooth, and look again from the better poses, until nothing new turns up."""
     poses = tracking.poses[tracking.keys]
-    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
     noise = match_noise(range_sigma)
+    way = _search(tracking, poses, noise).way
     chain, closures, failed = tracking.edges, _relinks(tracking, noise), dict[tuple[int, int], Array]()
     alone = [no_edges()]
     if len(closures.first):

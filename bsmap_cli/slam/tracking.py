@@ -253,8 +253,7 @@ def _not_drawn(
     away = (predicted - found.pose)[:2]
     if away @ away < NEAR * spread[0] ** 2 or not len(points.xy):
         return placed
-    c, s = math.cos(found.pose[2]), math.sin(found.pose[2])
-    normal = points.normal @ np.array([[c, s], [-s, c]])
+    normal = points.moved(found.pose).normal
     shares, axes = np.linalg.eigh(normal.T @ normal / len(normal))
     along = axes[:, 0]
     if shares[0] > FEW or (along @ away) ** 2 < NEAR * spread[0] ** 2:
